@@ -126,7 +126,7 @@ def test_pages_filters_and_sorting(server: viser.ViserServer, page: Page, trace:
     press("match-filter:all")
     ascending = press("match-sort:px")
     assert set(ascending[:20]) <= set((np.flatnonzero(trace.inlier_mask) + 10).tolist())
-    assert press("match-sort:px")[0] != ascending[0] and "behind" in table._html.content
+    assert press("match-sort:px")[0] != ascending[0] and "> 90°" in table._html.content
     for nonsense in ("match-sort:evil", "match-filter:evil", "match-page:-1", "match-page:x"):
         before = page.redraws
         press(nonsense)

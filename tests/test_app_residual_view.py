@@ -55,7 +55,7 @@ def test_bars_are_as_high_as_the_counts(run: Trace) -> None:
     marked = np.zeros(len(run.problem), dtype=bool)
     marked[[3, 5, 8, 13]] = True
     for shown in residuals.histograms:
-        root = ElementTree.fromstring(histogram_svg(shown, marked))
+        root = ElementTree.fromstring(histogram_svg(shown, residuals.names, marked))
         total = shown.right + shown.wrong
         y = Scale(0.0, 1.08 * total.max(), FOOT_PX, 20.0)
         right, wrong, chosen = (boxes(root, name) for name in ("right", "wrong", "chosen"))
@@ -78,7 +78,7 @@ def test_bars_are_as_high_as_the_counts(run: Trace) -> None:
 def test_the_bound_is_where_the_axis_says(run: Trace) -> None:
     residuals = residuals_of(run)
     assert residuals is not None
-    root = ElementTree.fromstring(histogram_svg(residuals.histograms[0], np.zeros(100, dtype=bool)))
+    root = ElementTree.fromstring(histogram_svg(residuals.histograms[0], residuals.names, np.zeros(100, dtype=bool)))
     line = next(p for p in root.iter(f"{SVG}path") if "stroke-dasharray" in p.attrib).attrib["d"]
     ticks = {item.text: float(item.attrib["x"]) for item in root.iter(f"{SVG}text")}
     # 8 px lies at log10(8) of the way from 1 to 10.
@@ -132,7 +132,8 @@ def test_runs_without_pose_or_truth_are_said_to_be(server: viser.ViserServer, ru
     assert chosen == []
     view.draw(replace(run, problem=replace(run.problem, truth_inliers=None)), (), np.arange(100))
     shown = unescape(view._html.content)
-    assert "by this run's inliers" in shown and "precision" not in shown and "clean sample" not in shown
+    assert "inliers</span>" in shown and "right</span>" not in shown and not re.search(r"\d right, ", shown)
+    assert "precision" not in shown and "clean sample" not in shown
 
 
 def test_the_history_shows_eq_28_and_the_first_clean_sample(run: Trace) -> None:

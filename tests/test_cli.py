@@ -119,7 +119,7 @@ def test_text_tells_what_is_proven(tmp_path: Path) -> None:
     scene = ROOT / "scenes" / "mei_outliers_90.toml"
     result = spherloc_here("run", scene, "--estimator", "mc-exact", "--no-record", cwd=tmp_path)
     assert "proven optimal: no pose explains more than" in result.stdout
-    assert "expected false sets of this size:" in result.stdout and "diagnosis" not in result.stdout
+    assert "NFA (expected number of false sets of this size):" in result.stdout and "diagnosis" not in result.stdout
 
 
 def test_doubtful_runs_get_a_line_of_diagnosis() -> None:

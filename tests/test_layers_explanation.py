@@ -142,7 +142,7 @@ def test_words_follow_the_evidence(trace: Trace) -> None:
     assert kept.verdict == "Kept, rightly" and "within its bound of 3 px" in kept.reason and kept.kept
     behind = int(np.flatnonzero(np.isinf(known.estimate.px))[0])
     away = explain(trace, behind)
-    assert away.verdict == "Rejected, rightly" and "its point is behind the camera" in away.reason
+    assert away.verdict == "Rejected, rightly" and "from the direction of its pixel" in away.reason
     assert f"{np.degrees(known.estimate.rad[behind]):.0f}°" in away.reason and "wrong match" in away.reason
     far = int(np.flatnonzero(~right & np.isfinite(known.estimate.px))[0])
     px = known.estimate.px[far]

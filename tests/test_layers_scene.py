@@ -71,8 +71,8 @@ def test_the_ellipsoid_is_that_of_the_covariance_by_the_factor_it_states(
     covariance = size**2 * spread @ spread.T
     items = last(with_covariance(turned, covariance))
     lines, label = items["uncertainty/ellipsoid"], text(items["uncertainty/sigmas"])
-    assert isinstance(lines, Segments) and label.startswith("3 σ")
-    factor = int(label.partition("drawn ")[2].removesuffix("×") or 1)
+    assert isinstance(lines, Segments) and label.startswith("3σ of the position")
+    factor = int(label.partition("enlarged ")[2].removesuffix("×") or 1)
     assert factor in FACTORS and (factor > 1) == (size < 3.0)
     assert turned.cam_from_map is not None
     turn = turned.problem.aligned.map_turn
@@ -114,7 +114,7 @@ def test_errors_are_drawn_and_said_as_the_metrics_have_them(turned: Trace) -> No
     assert isinstance(offset, Segments) and isinstance(angle, Segments)
     drawn, error = offset.points[0, 1] - offset.points[0, 0], camera_centre(truth) - camera_centre(estimated)
     degrees, _, rest = text(items["uncertainty/error"]).partition(" · ")
-    length, _, factor = rest.partition(", drawn ")
+    length, _, factor = rest.partition(", enlarged ")
     assert length == length_text(float(np.linalg.norm(error)))
     np.testing.assert_allclose(drawn, int(factor.removesuffix("×") or 1) * error, atol=1e-9)
     assert degrees == f"error {angle_text(rotation_error_deg(truth, estimated))}"

@@ -243,7 +243,7 @@ def test_without_a_second_arc_the_other_root_is_explained() -> None:
         clique=np.flatnonzero(np.isin(single, stage.clique)).astype(np.int32),
     )
     said = at(replace(trace, stages=(thin, *trace.stages[1:])), "yaw-roots").step.caption
-    assert re.search(r"behind the camera|too wide|only comes near", said) and " 0 have two arcs or more" in said
+    assert re.search(r"opposite to its bearing|too wide|only comes near", said) and " 0 have two arcs or more" in said
 
 
 def _arcs_of_same_pair(stage: YawStage) -> list[int]:

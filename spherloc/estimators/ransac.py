@@ -29,7 +29,7 @@ class RansacOptions(RefinementOptions):
     """Samples drawn; with a confidence, the most that are drawn: 99.9 % take 690 of them at 90 % outliers, 2,760 at
     95 %, 69,000 at 99 %."""
     confidence: float | None = None
-    """Stop as soon as Eq. 28 gives this probability of having drawn two inliers; None draws all samples."""
+    """Stop as soon as Eq. 28 gives this probability of having drawn two inliers; without it all samples are drawn."""
     scoring: Scoring = "count"
     """What makes a hypothesis the best: "count", the most inliers; "msac", the least squared error, where an outlier
     costs the squared bound."""

@@ -53,7 +53,7 @@ class SolverRansacOptions(RefinementOptions):
     iterations: int = 100
     """Samples drawn; with a confidence, the most that are drawn."""
     confidence: float | None = None
-    """Stop as soon as Eq. 28 gives this probability of having drawn inliers only; None draws all samples."""
+    """Stop as soon as Eq. 28 gives this probability of having drawn inliers only; without it all samples are drawn."""
     gravity_sd_deg: float | None = np.inf
     """Standard deviation of the known roll and pitch, degrees, for the refinement: inf ignores them, as the paper's
     baselines do; None takes the problem's."""

@@ -268,7 +268,7 @@ def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | No
         from spherloc_viz.layers.outcome import chance, proof, warning
 
         proven = proof(trace.certificate, int(np.count_nonzero(trace.inlier_mask)))
-        lines.append(f"  {proven}; expected false sets of this size: {chance(trace.certificate)}")
+        lines.append(f"  {proven}; NFA (expected number of false sets of this size): {chance(trace.certificate)}")
         lines += [f"  {sentence}" for sentence in (warning(trace.certificate),) if sentence]
     if diagnosis.doubtful:
         lines.append(f"  diagnosis: {diagnosis.cause}. {diagnosis.summary} {diagnosis.advice}".rstrip())

@@ -186,7 +186,7 @@ WHEN = f"""\
 
 Sec. VI-C.3 takes 2P-RANSAC up to 80 % outliers and MC beyond. Here, as they are in this project: the colour of a cell
 is the quickest of ransac-2p (1,000 samples), mc and mc-exact that is right in 95 % of the problems. Where a cell is
-grey, chance gives sets of matches as large as the largest that agree (expected false sets of that size: 1 or more), so
+grey, chance gives sets of matches as large as the largest that agree (an NFA of 1 or more), so
 no method that counts matches can know the answer.
 """
 BESIDE_P3P = """\

@@ -61,7 +61,7 @@ def _joined(*sentences: str) -> str:
 def _how_far(poses: Poses, residual: tuple[float, float]) -> str:
     px, degrees = residual
     if np.isinf(px):
-        return f"At the estimated pose its point is behind the camera: {degrees:.0f}° from the direction of its pixel."
+        return f"At the estimated pose its point is {degrees:.0f}° from the direction of its pixel."
     times = px / poses.bound_px
     if times < NEARLY:
         return f"At the estimated pose it is {_px(px)} off, just beyond its bound of {_px(poses.bound_px)}."
@@ -197,8 +197,12 @@ class Explanation:
     """Whether that is known from a label, and not only from its residual at the true pose."""
     bound_px: float
     """Bound on its residual at the run's pose; NaN if it is not usable."""
+    noise_only: bool
+    """Whether ``bound_px`` is for noise alone, as where the run estimated the tilt, and not for gravity's error too."""
     bound_deg: float
-    """Bound on the angular error of its bearing; NaN if it is not usable."""
+    """Bound on the angular error of its bearing, by noise and gravity's error; NaN if it is not usable."""
+    gravity_deg: float
+    """The part of gravity's error in it."""
     estimate: Residual | None
     """Residual at the run's pose; None without a pose or a bearing."""
     truth: Residual | None
@@ -266,7 +270,9 @@ def explain(trace: Trace, number: int, alternative_cam_from_map: FloatArray | No
         right=right,
         labelled=poses.labelled,
         bound_px=poses.bound_px,
+        noise_only=poses.bound_px <= bounds.noise_px,
         bound_deg=float(np.degrees(bounds.radians[place])) if usable else np.nan,
+        gravity_deg=float(np.degrees(problem.gravity_bound_rad)),
         estimate=estimate,
         truth=truth,
         others=len(others),

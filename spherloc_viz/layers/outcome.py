@@ -109,7 +109,7 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
 
 def _certified(certificate: Certificate, inliers: int) -> tuple[str, str]:
     """The proven bounds, as the end of a sentence, and as a note why they differ from the inliers, and the NFA."""
-    chances = f"Expected false sets of this size: {chance(certificate)}."
+    chances = f"NFA: {chance(certificate)} sets of {certificate.lower_bound} matches are expected to agree by chance."
     notes = (difference(certificate, inliers), chances, warning(certificate))
     return f"; {proof(certificate, inliers)}", " ".join(filter(None, notes))
 
@@ -124,7 +124,7 @@ def early_table(trace: Trace, judged: Judgement | None) -> Table:
     metrics = evaluate(trace)
     rows: list[tuple[str, str]] = [("estimator", trace.estimator), ("outcome", verdict(trace, metrics.success))]
     if trace.cam_from_map is not None:
-        rows.append(("without the truth", "…" if judged is None else _judged(judged)))
+        rows.append(("judged without the truth", "…" if judged is None else _judged(judged)))
         rows.append(("camera position", place_text(camera_centre(trace.cam_from_map), 3, trace.problem.metric)))
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         rows.append(("rotation error", f"{metrics.rotation_error_deg:.3f}°"))
@@ -149,7 +149,7 @@ def _judged(judged: Judgement) -> str:
 
 def _certificate_rows(certificate: Certificate, inliers: int) -> list[tuple[str, str]]:
     rows = [("certificate", proof(certificate, inliers).capitalize())]
-    rows.append(("expected false sets", f"{chance(certificate)} of {certificate.lower_bound} matches"))
+    rows.append(("NFA", f"{chance(certificate)} sets of {certificate.lower_bound} matches expected to agree by chance"))
     if not is_knowable(certificate):
         rows.append(("warning", UNKNOWABLE))
     return rows

@@ -115,14 +115,14 @@ def _outliers(view: RunView, stage: RefinementStage) -> Frame:
     state, mask = _last(view, stage)
     errors = view.residuals_px(state)[~mask]
     seen = errors[np.isfinite(errors)]
-    behind = len(errors) - len(seen)
+    far = len(errors) - len(seen)
     if not len(errors):
         told = "All matches are within the bound. None is rejected"
     elif not len(seen):
-        told = f"All {len(errors)} other matches lie behind the camera at this pose. No bound would make them agree"
+        told = f"All {len(errors)} others are more than 90° from their bearings. No bound would make them agree"
     else:
         told = (
-            f"{len(errors)} matches disagree, {behind} of them since their points would be behind their bearings. "
+            f"{len(errors)} matches disagree, {far} of them by more than 90°. "
             f"The median of the others is off by {np.median(seen):.0f} px and the nearest by {seen.min():.2f} px"
         )
     return Frame(

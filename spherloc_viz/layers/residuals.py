@@ -74,6 +74,8 @@ class Residuals:
     """The histograms in px and in degrees."""
     judged: str
     """The source that says which matches are right: "by the truth" or "by this run's inliers"."""
+    names: tuple[str, str]
+    """What the right and the wrong ones are called: the run's inliers are not said to be right."""
     blind: int
     """Number of matches whose pixel has no bearing."""
 
@@ -128,7 +130,8 @@ def residuals_of(trace: Trace) -> Residuals | None:
         histogram("px", px, right, _middle(limits_px), widened),
         histogram("deg", deg, right, _middle(np.degrees(limits_rad)), widened),
     )
-    return Residuals(px, deg, histograms, judged, int(np.count_nonzero(~problem.usable)))
+    names = ("inliers", "outliers") if problem.truth_inliers is None else ("right", "wrong")
+    return Residuals(px, deg, histograms, judged, names, int(np.count_nonzero(~problem.usable)))
 
 
 def _middle(values: FloatArray) -> tuple[float, float, float]:

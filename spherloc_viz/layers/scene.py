@@ -65,7 +65,7 @@ def ground(view: RunView) -> list[SceneItem]:
     lines.append(np.stack([rim[:-1], rim[1:]], axis=1))
     grid = np.concatenate(lines)
     edge = np.array([middle[0], high[1], middle[2]])
-    names = (("x", np.array([1.0, 0.0, 0.0])), ("z, yaw 0°", np.array([0.0, 0.0, 1.0])))
+    names = (("x axis", np.array([1.0, 0.0, 0.0])), ("z axis (yaw 0°)", np.array([0.0, 0.0, 1.0])))
     return [
         Segments("ground/grid", "ground", grid, one_color(style.GROUND, len(grid)), 1.0),
         *(Label(f"ground/{text[0]}", "ground", edge + (radius + 0.4 * cell) * along, text) for text, along in names),

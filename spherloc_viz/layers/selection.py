@@ -255,12 +255,12 @@ def _degrees(angle_rad: float) -> str:
 def _common(trace: Trace, numbers: IntArray) -> tuple[str, ...]:
     problem, known = trace.problem, verdicts(trace)
     unseen = int(np.count_nonzero(~problem.usable[numbers]))
-    behind = 0 if known.estimate is None else int(np.count_nonzero(np.isinf(known.estimate.px[numbers])))
+    far = 0 if known.estimate is None else int(np.count_nonzero(np.isinf(known.estimate.px[numbers])))
     sentences = []
     if unseen:
         sentences.append(f"The camera does not see {unseen} of their pixels.")
-    if behind:
-        sentences.append(f"The points of {behind} lie behind at the estimated pose.")
+    if far:
+        sentences.append(f"{far} are more than 90° off at the estimated pose.")
     if known.truth is not None and known.estimate is not None:
         lost = ~known.kept[numbers] & (known.truth.px[numbers] <= known.limit_px[numbers])
         if lost.any():

@@ -57,9 +57,9 @@ def _factor(length_m: float, sphere_m: float) -> int:
     return next((factor for factor in FACTORS if factor * length_m >= VISIBLE * sphere_m), FACTORS[-1])
 
 
-def drawn(factor: int) -> str:
+def enlarged(factor: int) -> str:
     """The end of a label that says by which factor the drawing is magnified; empty for 1."""
-    return "" if factor == 1 else f", drawn {factor}×"
+    return "" if factor == 1 else f", enlarged {factor}×"
 
 
 def _ellipsoid(view: RunView, frame: Frame, half_axes: FloatArray, factor: int) -> list[SceneItem]:
@@ -70,7 +70,7 @@ def _ellipsoid(view: RunView, frame: Frame, half_axes: FloatArray, factor: int) 
     ends = np.stack([lines[:-1], lines[1:]], axis=1)
     ends = np.delete(ends, [CORNERS, 2 * CORNERS + 1], axis=0)
     top = centre - np.array([0.0, np.linalg.norm(half_axes[:, 1]) + 0.1 * view.sphere_m, 0.0])
-    text = f"{SIGMAS:.0f} σ{drawn(factor)}"
+    text = f"{SIGMAS:.0f}σ of the position{enlarged(factor)}"
     return [
         Segments("uncertainty/ellipsoid", LAYER, ends, one_color(style.ESTIMATE, len(ends)), 1.5),
         Label("uncertainty/sigmas", LAYER, top, text, 0.055 * view.sphere_m),
@@ -89,7 +89,7 @@ def _offset(view: RunView, frame: Frame, factor: int) -> list[SceneItem]:
     factor = factor if factor * length_m <= ROOM * view.sphere_m else 1
     end = centre + factor * offset
     angle = angle_text(rotation_error_deg(view.truth, frame.cam_from_map))
-    text = f"error {angle} · {view.length_text(length_m)}{drawn(factor)}"
+    text = f"error {angle} · {view.length_text(length_m)}{enlarged(factor)}"
     # Below the sphere if the error is within it, else just below the line.
     away = BESIDE if factor * length_m < 2.0 * view.sphere_m else 0.3
     below = 0.5 * (centre + end) + np.array([0.0, away * view.sphere_m, 0.0])

@@ -233,8 +233,8 @@ def _why(roots: PairRoots, arcs: int) -> str:
         return f"{wave}, and both put its points in front of the camera: only other matches tell the two apart."
     if roots.in_front.all():
         return f"{wave}, but the arc around one of them is too wide to say much."
-    behind = two if roots.in_front[0] else one
-    return f"{wave}, but {behind} would put a point behind the camera."
+    other = two if roots.in_front[0] else one
+    return f"{wave}, but {other} would put a point opposite to its bearing."
 
 
 def _signed(value: float) -> str:

@@ -362,7 +362,7 @@ def list_page(course: Collection[Lesson], pictures: str) -> str:
         image = f'<img src="{pictures}{escape(lesson.name)}" alt="" loading="lazy">'
         rows[lesson.lecture].append(
             f'<li><a href="/learn/{escape(lesson.name)}">{image}<div><h2>{escape(lesson.title)}</h2>'
-            f"<p>{escape(lesson.summary)}</p><p class='dim'>{len(lesson.moments)} moments, about {lesson.minutes} min"
+            f"<p>{escape(lesson.summary)}</p><p class='dim'>{len(lesson.moments)} parts, about {lesson.minutes} min"
             "</p></div></a></li>"
         )
     return _page("list.html", lessons="".join(rows[False]), lectures="".join(rows[True]))

@@ -88,7 +88,7 @@ def test_the_exact_estimator_says_what_is_proven_and_options_change_a_run(tab: P
     expect(tab.value("estimator")).to_have_text("mc-exact")
     proven = re.compile(r"^Proven optimal: no pose explains more than (1[89]|2[0-2])$")
     expect(tab.value("certificate")).to_have_text(proven)
-    expect(tab.value("expected false sets")).to_have_text(re.compile(r"e-\d+ of (1[89]|2[0-2]) matches$"))
+    expect(tab.value("NFA")).to_have_text(re.compile(r"e-\d+ sets of (1[89]|2[0-2]) matches expected"))
     expect(tab.page.get_by_text(re.compile("; proven optimal: no pose explains more than"))).to_be_visible()
     shown = {
         "What no pose can beat, at each yaw": "ring/bound",

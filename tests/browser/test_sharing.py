@@ -196,11 +196,11 @@ def test_what_is_copied_repeats_the_run_to_the_last_bit(
     go_to(tab, "Matches")
     inlier, hidden = np.flatnonzero(run.inlier_mask)[:2].tolist()
     outlier = int(np.flatnonzero(~run.inlier_mask)[0])
-    for action, number in (("Spoil", inlier), ("Mend", outlier), ("Hide", hidden)):
+    for action, number in (("Make wrong", inlier), ("Make right", outlier), ("Hide", hidden)):
         tab.page.locator(f"tr[data-touch='select:{number}']").click()
         expect(tab.page.get_by_text(f"Match {number}", exact=True)).to_be_visible()
         tab.press(action)
-    expect(tab.page.get_by_text(re.compile("^Matches by hand: 1 spoiled, 1 mended, 1 hidden"))).to_be_visible()
+    expect(tab.page.get_by_text(re.compile("^Matches by hand: 1 made wrong, 1 made right, 1 hidden"))).to_be_visible()
     expect(tab.value("inliers")).to_have_text(re.compile(" of 39$"))
     asked = {"iterations": 321, "confidence": 0.9}
     while not (asked.items() <= run.options.items() and len(run.problem) == 39):

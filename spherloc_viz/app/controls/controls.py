@@ -10,7 +10,6 @@ from typing import Any, Literal, Protocol
 import viser
 
 from spherloc.datasets.map_scene import MapScene
-from spherloc.datasets.variation import EDITS
 from spherloc.diagnosis import Diagnosis
 from spherloc.errors import InputError
 from spherloc.trace import Trace
@@ -366,13 +365,17 @@ class Controls:
         return self._catalog.path(request.scene), request
 
 
+DONE = {"spoiled": "made wrong", "mended": "made right", "hidden": "hidden"}
+"""What was done to single matches, by the field of a variation, in words."""
+
+
 def _changes_html(run: Run) -> str:
     """What is not as the scene's name says, and what was done to single matches; empty if nothing was."""
     variation, parts = run.request.scene.variation, []
     label, name = run.request.scene.scene, run.trace.problem.name.removesuffix(", edited")
     if not name.startswith(label) and not label.startswith(name):
         parts.append(f"Changed: {escape(name)}")
-    done = [f"{len(getattr(variation, name))} {name}" for name in EDITS if getattr(variation, name)]
+    done = [f"{len(getattr(variation, name))} {words}" for name, words in DONE.items() if getattr(variation, name)]
     if done:
         links = [("unedit:", "take back")] + [("unhide:", "show hidden")] * bool(variation.hidden)
         ways = " · ".join(f'<u data-touch="{action}" role="button" tabindex="0">{words}</u>' for action, words in links)

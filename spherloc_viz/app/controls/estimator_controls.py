@@ -191,6 +191,8 @@ def _range(field: OptionField) -> str:
 
 def _label(name: str) -> str:
     """ "time_budget_ms" as "Time budget (ms)"."""
+    if name == "as_printed":
+        return "As in the paper"
     words, _, unit = name.rpartition("_")
     text, suffix = (words, f" ({UNITS[unit]})") if unit in UNITS and words else (name, "")
     return text.replace("_", " ").capitalize() + suffix

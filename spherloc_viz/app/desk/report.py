@@ -10,6 +10,7 @@ from spherloc_viz import style
 from spherloc_viz.app.desk.comparison import Change, Comparison, Pair, causes
 from spherloc_viz.app.review import words
 from spherloc_viz.app.review.rows import badge_html, label_html, picture_html
+from spherloc_viz.layers.primitives import true_minus
 from spherloc_viz.recording.run_row import RunRow
 
 CSS = """
@@ -182,7 +183,7 @@ def _changes(changes: Sequence[Change]) -> str:
     heads = ("", "pairs", "median before", "median after", "median difference", "p (Wilcoxon)")
     body = "".join(
         f"<tr><td>{escape(change.title)}</td><td>{change.pairs:,}</td><td>{number(change.before)}</td>"
-        f"<td>{number(change.after)}</td><td>{number(change.difference)}</td><td>{p_text(change.p)}</td></tr>"
+        f"<td>{number(change.after)}</td><td>{true_minus(number(change.difference))}</td><td>{p_text(change.p)}</td></tr>"
         for change in changes
     )
     return f"<h2>Paired differences</h2><table><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr>{body}</table>"

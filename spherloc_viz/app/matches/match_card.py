@@ -183,15 +183,17 @@ def _walk(number: int, kept: NDArray) -> str:
 def _actions(trace: Trace, count: int, editable: bool) -> str:
     deselect = chip("Deselect", "deselect:", False)
     if not editable:
-        changes = (_disabled(words, "Only the presenter changes matches") for words in ("Spoil", "Mend", "Hide"))
+        changes = (
+            _disabled(words, "Only the presenter changes matches") for words in ("Make wrong", "Make right", "Hide")
+        )
         return box("".join(changes) + deselect)
     it = "this match" if count == 1 else "these matches"
     mend = (
-        chip("Mend", "mend:", False, f"Put {it} where the true pose sees the point")
+        chip("Make right", "mend:", False, f"Put {it} where the true pose sees the point")
         if trace.problem.truth_cam_from_map is not None
-        else _disabled("Mend", "The true pose is unknown, and so is the right pixel")
+        else _disabled("Make right", "The true pose is unknown, and so is the right pixel")
     )
-    spoil = chip("Spoil", "spoil:", False, f"Give {it} a wrong pixel at random")
+    spoil = chip("Make wrong", "spoil:", False, f"Give {it} a wrong pixel at random")
     hide = chip("Hide", "hide:", False, f"Leave {it} out of the problem")
     return box(f"{spoil}{mend}{hide}{deselect}")
 
@@ -231,7 +233,7 @@ def _notes(what: Explanation, kept: NDArray) -> str:
     """In small type: its bound and label, the pairs that exclude the true yaw, and its part in the stages."""
     notes = []
     if what.usable:
-        notes.append(f"Its bound is {_px(what.bound_px)}, or {what.bound_deg:.2f}° for its bearing.")
+        notes.append(_bounds(what))
     if what.right is not None and what.labelled:
         notes.append(f"Its label says {'inlier' if what.right else 'outlier'}.")
     if what.silent:
@@ -243,6 +245,20 @@ def _notes(what: Explanation, kept: NDArray) -> str:
         part = "; ".join(what.stages)
         notes.append(escape(f"{part[:1].upper()}{part[1:]}."))
     return box(f'<div style="{DIM}">{" ".join(notes)}</div>', "font-size:12px")
+
+
+def _bounds(what: Explanation) -> str:
+    """Both bounds, and whether gravity's error is in them."""
+    px, bearing, gravity = (
+        _px(what.bound_px),
+        f"{what.bound_deg:.2f}°",
+        f"gravity's error of up to {what.gravity_deg:.2g}°",
+    )
+    if what.gravity_deg == 0.0:
+        return f"Its bound is {px}, or {bearing} for its bearing."
+    if what.noise_only:
+        return f"Its bound is {px} for noise alone; its bearing may be {bearing} off by noise and {gravity}."
+    return f"Its bound for noise and {gravity} is {px}, or {bearing} for its bearing."
 
 
 def _excluding(number: int, pairs: Pairs, kept: NDArray) -> str:
@@ -258,4 +274,4 @@ def _excluding(number: int, pairs: Pairs, kept: NDArray) -> str:
 
 
 def _px(value: float) -> str:
-    return "behind" if np.isinf(value) else f"{value:.3g} px" if value < 1000 else f"{value:,.0f} px"
+    return "over 90°" if np.isinf(value) else f"{value:.3g} px" if value < 1000 else f"{value:,.0f} px"

@@ -57,7 +57,7 @@ COLUMNS = (
     ("number", "match", "Its number"),
     ("run", "run", "Whether the run calls it an inlier"),
     ("truth", "truth", "Whether it truly is one"),
-    ("px", "px", "Reprojection error at the estimated pose, px"),
+    ("px", "px", "Reprojection error at the estimated pose, px; there is none more than 90° from its bearing"),
     ("deg", "deg", "Angle between its bearing and its point at the estimated pose, degrees"),
     ("agrees", "agrees", "With how many inliers it makes a pair that agrees at the estimated yaw"),
 )
@@ -194,7 +194,7 @@ def _word(inlier: bool) -> str:
 def _number(value: float) -> str:
     if np.isnan(value):
         return "–"
-    return "behind" if np.isinf(value) else f"{value:.2f}" if value < 100 else f"{value:,.0f}"
+    return "> 90°" if np.isinf(value) else f"{value:.2f}" if value < 100 else f"{value:,.0f}"
 
 
 def _pages(rows: MatchRows, listed: IntArray, look: Look) -> str:

@@ -37,9 +37,9 @@ GAP_PX = 5.0
 UNITS = {"px": "residual (px)", "deg": "residual (°)"}
 
 
-def histogram_svg(histogram: Histogram, selected: NDArray[np.bool_]) -> str:
-    """A histogram, right matches below wrong ones; outlines show how many of the ``selected`` (N,) matches are in a
-    bin. Every bin that is not empty can be pressed."""
+def histogram_svg(histogram: Histogram, names: tuple[str, str], selected: NDArray[np.bool_]) -> str:
+    """A histogram, right matches below wrong ones, which have these ``names``; outlines show how many of the
+    ``selected`` (N,) matches are in a bin. Every bin that is not empty can be pressed."""
     total = histogram.right + histogram.wrong
     top = 1.08 * max(1, int(total.max()))
     y = Scale(0.0, top, FOOT_PX, TOP_PX)
@@ -62,11 +62,13 @@ def histogram_svg(histogram: Histogram, selected: NDArray[np.bool_]) -> str:
     parts += [shapes.text(WIDTH_PX - RIGHT_PX, FOOT_PX + 29, f"≥ {texts_x[-1]}", "end"), *_bound(histogram, x)]
     across = [left_px + step * k + GAP_PX * ((k > 0) + (k == bins - 1)) + 0.5 for k in range(bins)]
     chosen = np.bincount(histogram.bin[selected], minlength=bins)
-    parts += _bars(histogram, chosen, across, step - 1.0, y)
+    parts += _bars(histogram, names, chosen, across, step - 1.0, y)
     return shapes.svg(WIDTH_PX, HEIGHT_PX, parts, f"Histogram of residuals, {UNITS[histogram.unit]}")
 
 
-def _bars(histogram: Histogram, chosen: NDArray[np.int64], across: list[float], width: float, y: Scale) -> list[str]:
+def _bars(
+    histogram: Histogram, names: tuple[str, str], chosen: NDArray[np.int64], across: list[float], width: float, y: Scale
+) -> list[str]:
     """One path per colour, and over each bin that is not empty an area to press, as high as the plot."""
     feet, middle = np.full(len(across), FOOT_PX), y.px(histogram.right)
     top = y.px(histogram.right + histogram.wrong)
@@ -82,7 +84,7 @@ def _bars(histogram: Histogram, chosen: NDArray[np.int64], across: list[float], 
     rows = zip(across, words, histogram.right.tolist(), histogram.wrong.tolist(), strict=True)
     for place, (left, range_words, right, wrong) in enumerate(rows):
         if right + wrong:
-            tip = shapes.tooltip(f"{range_words}: {right} right, {wrong} wrong; click to select")
+            tip = shapes.tooltip(f"{range_words}: {right} {names[0]}, {wrong} {names[1]}; click to select")
             parts.append(shapes.rect(left, TOP_PX, width, FOOT_PX - TOP_PX, f'{press}{place}"', tip))
     return parts
 
@@ -209,16 +211,17 @@ def _residuals_html(residuals: Residuals | None, selected: tuple[int, ...]) -> s
         return box(_title("Residuals") + "This run found no pose, so that matches have no residuals.")
     marked = np.zeros(len(residuals.px), dtype=bool)
     marked[list(selected)] = True
-    drawings = "".join(histogram_svg(one, marked) for one in residuals.histograms)
+    drawings = "".join(histogram_svg(one, residuals.names, marked) for one in residuals.histograms)
     note = _note(residuals_caption(residuals))
-    return box(_title("Residuals at the estimated pose", "residual") + _legend_html(residuals.judged) + drawings + note)
+    return box(_title("Residuals at the estimated pose", "residual") + _legend_html(residuals) + drawings + note)
 
 
-def _legend_html(judged: str) -> str:
-    """The meaning of the colours: here whether a match is right, elsewhere whether the run kept it."""
+def _legend_html(residuals: Residuals) -> str:
+    """The meaning of the colours: whether a match is right or, where no truth may tell, whether the run kept it."""
+    judged = residuals.judged if "right" in residuals.names else "of this run"
     dots = "".join(
         f'<span style="margin-right:1.1em">{dot_html(color)}{words}</span>'
-        for color, words in ((style.INLIER, "right"), (style.OUTLIER, "wrong"))
+        for color, words in zip((style.INLIER, style.OUTLIER), residuals.names, strict=True)
     )
     return f'<div style="font-size:12px;padding-bottom:.3em">{dots}<span style="{DIM}">{escape(judged)}</span></div>'
 

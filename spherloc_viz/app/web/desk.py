@@ -25,6 +25,7 @@ from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.web.access import SAFE, SORRY_POLICY, sorry_page
 from spherloc_viz.app.web.downloads import Download, Downloads
 from spherloc_viz.app.web.viewer import viewer_link
+from spherloc_viz.layers.primitives import true_minus
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.checks import is_thumbnail
 
@@ -244,7 +245,8 @@ class DeskRoom:
             "brokenCauses": causes(found.broken),
             "p": p_text(found.p),
             "changes": [
-                [c.title, number(c.before), number(c.after), number(c.difference), p_text(c.p)] for c in found.changes
+                [c.title, number(c.before), number(c.after), true_minus(number(c.difference)), p_text(c.p)]
+                for c in found.changes
             ],
             "address": self._offer(name, comparison_html(found, before_name, after_name, now)),
             "name": name,
