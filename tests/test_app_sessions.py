@@ -19,8 +19,10 @@ from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
 from spherloc.geometry import align_to_down, camera_centre
 from spherloc.trace import Trace
+from spherloc_viz.app import compilation
 from spherloc_viz.app import session as session_module
 from spherloc_viz.app.catalog import Catalog
+from spherloc_viz.app.compilation import Compilation
 from spherloc_viz.app.server import Sessions
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
@@ -442,6 +444,23 @@ def test_a_page_that_is_opened_by_a_link_begins_with_it(house: House, monkeypatc
     session.step_history(-1)
     until(lambda: session._asked == deque() and session._controls.scene._seed.value == "6")
     assert solved == ["ransac-2p"] and len(house.notes.traces) == 1
+
+
+def test_a_page_that_waits_for_its_first_estimator_says_so_in_the_canvas(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate = threading.Event()
+    monkeypatch.setattr(compilation, "compile_apart", lambda estimator, stopped: gate.wait(LIMIT_S))
+    house.services.compilation = Compilation(["mc"])
+    house.services.compilation.start()
+    house.pages.append(Page(house.server.get_port(), KEY))
+    until(lambda: len(house.sessions._open) == 1)
+    (session,) = house.sessions._open.values()
+    card = session._display.panels._card
+    until(lambda: "Compiling mc, once after an installation" in card.content)
+    assert "tiny" in card.content and session._run is None
+    gate.set()
+    until(lambda: session._run is not None and card.content == "")
 
 
 def test_undo_takes_back_a_change_that_cannot_be_and_nothing_before_it(house: House) -> None:

@@ -213,7 +213,15 @@ class Session:
     def prepare_estimator(self, name: str, watch: Watch) -> None:
         """Return when an estimator is compiled; raises ``Cancelled`` if ``watch`` ends that."""
         if self._services.compilation is not None:
-            self._services.compilation.wait_for(name, watch, self._status.say)
+            self._services.compilation.wait_for(name, watch, self._say_wait)
+
+    def _say_wait(self, sentence: str) -> None:
+        """Say why an estimator is not ready; a page without a run shows that in its empty canvas."""
+        self._status.say(sentence)
+        if self._run is None:
+            panels = self._display.panels
+            panels.begin_opening(self._controls.scene.read().scene)
+            panels.tell_opening(sentence, 0.0)
 
     def _move_camera(self, true_camera: TrueCamera) -> None:
         self._controls.scene.true_camera = true_camera
