@@ -134,3 +134,6 @@ def test_the_note_is_true_of_one_node_and_of_few(mc: Trace) -> None:
             assert f"each of the {shown:,} nodes." in notes[key]
             assert ("no edge" in notes[key]) == (total == 0)
         assert "All 0" not in notes[key] and "All 1 " not in notes[key]
+    stage = mc.stage(TranslationStage)
+    assert stage is not None
+    assert f"of {len(np.unique(stage.pairs[stage.clique]))} matches. The Matches tab lists" in notes["clique"]

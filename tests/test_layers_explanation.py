@@ -16,10 +16,10 @@ from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.estimators import estimate
 from spherloc.geometry import pose, transform, yaw_of, yaw_rotation
 from spherloc.problem import Problem
-from spherloc.trace import Trace, TranslationStage, YawStage
+from spherloc.trace import ConsensusStage, Trace, TranslationStage, YawStage
 from spherloc_viz.layers.agreement import agreement, partner_arcs, unbounded
 from spherloc_viz.layers.explanation import WORST, explain
-from spherloc_viz.layers.matches import FILTERS, SORTS, match_rows, order
+from spherloc_viz.layers.matches import FILTERS, IN_CLIQUE, SORTS, match_rows, offered, order
 from spherloc_viz.layers.residuals import run_bounds, verdicts
 from spherloc_viz.layers.selection import MAX_COMPARED, explain_many
 
@@ -274,7 +274,20 @@ def test_rows_filter_and_sort(trace: Trace) -> None:
     assert np.all(np.diff(finite) >= 0) and np.isinf(ascending[len(finite) :]).all()
     most = rows.agree[order(rows, "all", "agrees", False)]
     assert np.all(np.diff(most) <= 0) and rows.partners == right.sum() and most[0] == right.sum() - 1
-    assert set(FILTERS) == {"all", "inliers", "outliers", "wrongly kept", "wrongly rejected"}
+    assert set(FILTERS) == {"all", "inliers", "outliers", IN_CLIQUE, "wrongly kept", "wrongly rejected"}
+
+
+def test_members_of_the_clique_are_listed_where_there_is_one(scene_of: SceneOf) -> None:
+    problem = scene_of("mei", correspondences=60).problem()
+    balls, exact = estimate(problem, "mc"), estimate(problem, "mc-exact")
+    found, consensus = balls.stage(TranslationStage), exact.stage(ConsensusStage)
+    assert found is not None and consensus is not None
+    listed = order(match_rows(balls), IN_CLIQUE, "number", False)
+    assert listed.tolist() == np.unique(found.pairs[found.clique]).tolist() and 2 < len(listed) < 60
+    assert order(match_rows(exact), IN_CLIQUE, "number", False).tolist() == np.sort(consensus.clique).tolist()
+    assert set(offered(match_rows(balls))) == set(FILTERS)
+    blind = replace(problem, truth_cam_from_map=None, truth_inliers=None)
+    assert offered(match_rows(estimate(blind, "ransac-2p"))) == ("all", "inliers", "outliers")
 
 
 def test_many_inliers_are_sampled(scene_of: SceneOf, monkeypatch: pytest.MonkeyPatch) -> None:

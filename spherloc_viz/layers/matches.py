@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from spherloc.cameras.base import Camera
 from spherloc.geometry import yaw_of
 from spherloc.problem import Problem
-from spherloc.trace import Trace
+from spherloc.trace import ConsensusStage, Trace, TranslationStage
 from spherloc.types import BoolArray, ByteArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers.agreement import agreement
@@ -40,17 +40,28 @@ class MatchRows:
     """(N,) number of ``partners`` with which it makes a pair that agrees at the run's yaw; -1 if unknown."""
     partners: int
     """Number of inliers of the run with which pairs were computed."""
+    clique: BoolArray | None
+    """(N,) members of the maximum clique: matches, or those of its balls; None if the run looked for no clique."""
 
 
 Filter = Callable[[MatchRows], BoolArray]
+IN_CLIQUE = "in the maximum clique"
 FILTERS: dict[str, Filter] = {
     "all": lambda rows: np.ones(len(rows.kept), dtype=bool),
     "inliers": lambda rows: rows.kept,
     "outliers": lambda rows: ~rows.kept,
+    IN_CLIQUE: lambda rows: np.zeros(len(rows.kept), dtype=bool) if rows.clique is None else rows.clique,
     "wrongly kept": lambda rows: rows.kept & (_known(rows) == 0),
     "wrongly rejected": lambda rows: ~rows.kept & (_known(rows) == 1),
 }
 """The filters of the table: which matches are listed, by name."""
+
+
+def offered(rows: MatchRows) -> tuple[str, ...]:
+    """The filters that can be told of these matches."""
+    untold = {"wrongly kept", "wrongly rejected"} if rows.right is None else set()
+    untold |= {IN_CLIQUE} if rows.clique is None else set()
+    return tuple(name for name in FILTERS if name not in untold)
 
 
 def _known(rows: MatchRows) -> NDArray[np.int8]:
@@ -77,7 +88,20 @@ def match_rows(trace: Trace) -> MatchRows:
     px = nothing if known.estimate is None else known.estimate.px
     deg = nothing if known.estimate is None else np.degrees(known.estimate.rad)
     agree, partners = _agreeing(trace)
-    return MatchRows(known.kept, known.right, px, deg, agree, partners)
+    return MatchRows(known.kept, known.right, px, deg, agree, partners, _in_clique(trace))
+
+
+def _in_clique(trace: Trace) -> BoolArray | None:
+    """Members (N,) of the maximum clique that the run found; None if it looked for none."""
+    balls, consensus = trace.stage(TranslationStage), trace.stage(ConsensusStage)
+    if balls is None and consensus is None:
+        return None
+    members = np.zeros(len(trace.problem), dtype=bool)
+    if balls is not None:
+        members[balls.pairs[balls.clique]] = True
+    if consensus is not None:
+        members[consensus.clique] = True
+    return members
 
 
 def order(rows: MatchRows, shown: str, by: str, down: bool) -> IntArray:

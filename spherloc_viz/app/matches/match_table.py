@@ -15,7 +15,7 @@ from spherloc_viz import style
 from spherloc_viz.app.text import DIM, WITHHELD, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import update_widget
-from spherloc_viz.layers.matches import FILTERS, SORTS, MatchRows, match_rows, order, reference_votes
+from spherloc_viz.layers.matches import FILTERS, SORTS, MatchRows, match_rows, offered, order, reference_votes
 
 MAX_REFERENCES = 8
 
@@ -104,6 +104,7 @@ class MatchTable:
         if self._drawn is not None and self._drawn[0] is trace and self._drawn[1:] == drawn[1:]:
             return
         rows, look = match_rows(trace), self._look
+        look = look if look.shown in offered(rows) else replace(look, shown="all")
         listed = order(rows, look.shown, look.by, look.down)
         pages = max(1, -(-len(listed) // PAGE))
         page = min(look.page, pages - 1)
@@ -154,10 +155,9 @@ def table_html(rows: MatchRows, listed: IntArray, look: Look, selected: frozense
 
 def _filters(rows: MatchRows, look: Look) -> str:
     chips = []
-    for name, choose in FILTERS.items():
-        if name.startswith("wrongly") and rows.right is None:
-            continue
-        chips.append(chip(f"{name} {np.count_nonzero(choose(rows)):,}", f"match-filter:{name}", name == look.shown))
+    for name in offered(rows):
+        count = np.count_nonzero(FILTERS[name](rows))
+        chips.append(chip(f"{name} {count:,}", f"match-filter:{name}", name == look.shown))
     return "".join(chips)
 
 

@@ -17,6 +17,7 @@ from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers.frame import even
+from spherloc_viz.layers.matches import IN_CLIQUE
 from spherloc_viz.layers.primitives import Graph
 
 CELL = "graph-cell"
@@ -82,7 +83,17 @@ def graph_note(graph: Graph, edges: Edges) -> str:
     else:
         said.append("No two of them agree yet, so there is no edge.")
     said.append(f"The matrix has a row and a column for each of the {shown:,} nodes.")
-    return " ".join([*said, press])
+    return " ".join([*_listed(graph), *said, press])
+
+
+def _listed(graph: Graph) -> list[str]:
+    """Where the members of the clique are listed, if nodes of the clique are marked."""
+    if graph.color != style.CLIQUE or not graph.marked.any():
+        return []
+    count = len(np.unique(graph.nodes.matches[graph.marked]))
+    return [
+        f'Marked: nodes of {count:,} matches. The Matches tab lists all members ("{IN_CLIQUE}").'
+    ]
 
 
 def _many(name: str) -> str:
