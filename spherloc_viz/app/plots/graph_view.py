@@ -91,9 +91,7 @@ def _listed(graph: Graph) -> list[str]:
     if graph.color != style.CLIQUE or not graph.marked.any():
         return []
     count = len(np.unique(graph.nodes.matches[graph.marked]))
-    return [
-        f'Marked: nodes of {count:,} matches. The Matches tab lists all members ("{IN_CLIQUE}").'
-    ]
+    return [f'Marked: nodes of {count:,} matches. The Matches tab lists all members ("{IN_CLIQUE}").']
 
 
 def _many(name: str) -> str:
