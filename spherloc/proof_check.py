@@ -152,7 +152,7 @@ def _bound(matches: Arrays, chart: int, lower: NDArray[Any], upper: NDArray[Any]
     near = delta >= 0.998 * distance
     d, delta = np.where(near, 1.0, distance), np.where(near, 0.0, delta)
     rotation = tilt @ _turn_y(yaw)
-    u, turn = w / d[:, None], float(half[3:].sum()) + SLACK
+    u, turn = w / d[:, None], float(half[4:].sum()) + SLACK  # the tilts'
     linear = matches["weights"] @ rotation
     r = np.einsum("nij,nj->ni", linear, u)
     size = np.linalg.norm(r, axis=1)
@@ -164,8 +164,11 @@ def _bound(matches: Arrays, chart: int, lower: NDArray[Any], upper: NDArray[Any]
         moves.append(h * np.einsum("nij,nj->ni", linear, across) / d[:, None])
     ratio = delta / d
     e, px = ratio / (1.0 - ratio), matches["px_per_rad"]
-    alpha = turn + np.arcsin(ratio)
-    rest = px * (0.5 * (turn**2 + 2.0 * turn * e + 2.0 / np.sqrt(3.0) * e**2) + SLACK)
+    level = np.hypot(u[:, 0], u[:, 2])
+    alpha = turn + half[3] * level + np.arcsin(ratio)
+    by_yaw = half[3] * np.minimum(level + np.arcsin(ratio), 1.0)
+    second = turn**2 + (2.0 * turn + half[3]) * by_yaw + 2.0 * (turn + half[3]) * e + 2.0 / np.sqrt(3.0) * e**2
+    rest = px * (0.5 * second + SLACK)
     radial = r / np.maximum(size, 1e-300)[:, None]
     reach = sum(np.abs(np.einsum("ni,ni->n", move, radial)) for move in moves) + rest
     out = size - np.minimum(np.where(size > 0.0, reach, np.inf), px * alpha) > matches["bound_px"]

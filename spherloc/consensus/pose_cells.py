@@ -18,16 +18,19 @@ psi = |(h_a, h_c)|: T(middle)^T T is a product of turns by h_a and h_c about ort
 cos(h_a / 2) cos(h_c / 2). Over all tilts, from no tilt, cos(psi / 2) >= (1 + sqrt(cos gamma)) / 2: the product of
 cos^2(a / 2) cos^2(c / 2) = (1 + cos a)(1 + cos c) / 4 is least where cos a = cos c.
 
-**The residual** of a correspondence is r = W g, g = R w / |w|; it is explained if |r| <= tau and v . g > 0. Along a
-straight line of parameters from the middle, |g''| <= t^2 + 2 t e + (2 / sqrt 3) e^2, where t = h_yaw + h_a + h_c and
-e = delta / (d - delta): each of the three turns contributes its speed once to g' and twice to g'', and for
-u = w / |w|, w' = D with part p across and q along w, |u'| = p / |w| and |u''| = p sqrt(p^2 + 4 q^2) / |w|^2, which is
-largest, (2 / sqrt 3) |D|^2 / |w|^2, at p^2 = 2/3 |D|^2. So over the cell r differs from its linear form by at most
+**The residual** of a correspondence is r = W g, g = R u, u = w / |w|; it is explained if |r| <= tau and v . g > 0.
+Along a straight line of parameters from the middle u moves by e = delta / (d - delta) at most, for w' = D with part p
+across and q along w makes |u'| = p / |w|, and |u''| = p sqrt(p^2 + 4 q^2) / |w|^2, which is largest,
+(2 / sqrt 3) |D|^2 / |w|^2, at p^2 = 2/3 |D|^2. A tilt turns all directions, t = h_a + h_c; yaw moves u by h_yaw times
+its horizontal length only, at most y = h_yaw (l + asin(delta / d)), l being that length in the middle. Each of these
+speeds enters g' once and g'' twice, so that
 
-    |W| (t^2 + 2 t e + (2 / sqrt 3) e^2) / 2                                                            (remainder)
+    |g''| <= t^2 + 2 t y + h_yaw y + 2 (t + h_yaw) e + (2 / sqrt 3) e^2,
 
-and, without any derivative, from r in the middle by at most |W| (t + asin(delta / d)). W is the matrix
-``pixel_from_bearing`` and |W| its larger singular value, ``pixels_per_radian``.
+the third term for the acceleration on a circle of yaw. Over the cell r differs from its linear form by at most
+|W| / 2 times that (remainder) and, without any derivative, from r in the middle by at most
+|W| (t + h_yaw l + asin(delta / d)). W is the matrix ``pixel_from_bearing`` and |W| its larger singular value,
+``pixels_per_radian``.
 
 **Rounding.** ``SLACK`` is added to every angle, and to delta what the coordinates' own rounding may be: some 10^5 times
 the rounding of the few operations between them and a comparison.

@@ -143,7 +143,7 @@ def sort_matches(matches, cell, axis, members, kept, forms, cutoff, reach):
     # Axes of the tilts seen from the map: R^T e_x and R^T (0, -sin a, cos a).
     ax, ay, az = r00, r01, r02
     bx, by, bz = ca * r20 - sa * r10, ca * r21 - sa * r11, ca * r22 - sa * r12
-    turn = hy + ha + hc + SLACK
+    tilt = ha + hc + SLACK
     fill_vector(reach, 0.0)
     sure, undecided, inside = 0, 0, 0
     spare = len(members) - cutoff
@@ -178,7 +178,8 @@ def sort_matches(matches, cell, axis, members, kept, forms, cutoff, reach):
         r2 = u * u + v * v
         tau = row[BOUND_PX]
         # asin(x) <= x / sqrt(1 - x^2)
-        alpha = turn + ratio / np.sqrt(1.0 - ratio * ratio)
+        shift, level = ratio / np.sqrt(1.0 - ratio * ratio), np.sqrt(x * x + z * z)
+        alpha = tilt + hy * level + shift
         move = px * alpha
         if r2 > (tau + move) * (tau + move):
             gone += 1
@@ -193,7 +194,9 @@ def sort_matches(matches, cell, axis, members, kept, forms, cutoff, reach):
             continue
         r = np.sqrt(r2)
         e = ratio / (1.0 - ratio)
-        rest = px * (0.5 * (turn * turn + 2.0 * turn * e + CURVATURE * e * e) + SLACK)
+        by_yaw = hy * min(level + shift, 1.0)
+        second = tilt * tilt + (2.0 * tilt + hy) * by_yaw + (2.0 * (tilt + hy) + CURVATURE * e) * e
+        rest = px * (0.5 * second + SLACK)
         nu, nv = (u / r, v / r) if r > 0.0 else (1.0, 0.0)
         # Derivative by yaw: W R (e_y x w).
         p, q = m00 * z - m02 * x, m10 * z - m12 * x

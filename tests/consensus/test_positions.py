@@ -130,6 +130,13 @@ def test_against_brute_force(seed):
     assert one.found <= one.lower_bound or one.lower_bound < one.upper_bound
 
 
+@pytest.mark.parametrize("seed", [1052, 1178, 1346, 1388])
+def test_near_vertical_bearings_do_not_use_up_the_effort(seed):
+    """Yaw hardly moves them, and so their bounds must not be wide where only yaw is."""
+    one = check(seed)
+    assert one.found <= one.lower_bound == one.upper_bound
+
+
 def everything(aligned, start=None, effort=10**9):
     return search_positions(aligned, pack_matches(aligned, BOUND_PX), start, effort, working_s() + 600.0)
 
