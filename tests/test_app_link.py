@@ -58,7 +58,7 @@ def test_what_is_written_is_read_again(place: Place) -> None:
     options = replace(default_options("ransac-2p", place.catalog.problem(scene)), iterations=77, confidence=0.97)
     viewpoint = (1.5, -2.25, 3.0, 0.0, 0.125, -1e-05, 45.0)
     request = RunRequest(scene, "ransac-2p", options)
-    view = PageView("sample-3", (2, 4), "light", answers_hidden=True, viewpoint=viewpoint)
+    view = PageView("sample-3", (2, 4), "light", answers_hidden=True, viewpoint=viewpoint, tab="Graph")
     found = place.follower.follow(place.link(request, view), place.now, VIEW)
     assert (found.request, found.view, found.remarks) == (request, view, ())
     assert place.follower.follow("", place.now, VIEW).remarks == ()
@@ -102,6 +102,7 @@ def test_a_scene_of_an_allowed_folder_is_opened_again(place: Place) -> None:
         ("view", "1,2,nan,0,0,0,45", "view is"),
         ("view", "1,2,3,0,0,0,999", "view is"),
         ("theme", "pink", "theme is 'pink'; it is dark or light."),
+        ("tab", "Play", "tab is 'Play'; it is step's or Yaw or Graph"),
     ],
 )
 def test_what_is_wrong_is_a_remark_and_the_rest_is_opened(place: Place, key: str, value: str, remark: str) -> None:

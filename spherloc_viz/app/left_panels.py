@@ -11,6 +11,7 @@ from spherloc_viz.app.catalog import Run
 from spherloc_viz.app.controls.steps_panel import StepsPanel
 from spherloc_viz.app.glossary import glossary_html, heading_html
 from spherloc_viz.app.introduction import introduction_html
+from spherloc_viz.app.link import TABS
 from spherloc_viz.app.matches.image_panel import ImagePanel
 from spherloc_viz.app.matches.lens_panel import LensPanel
 from spherloc_viz.app.matches.match_table import MatchTable
@@ -52,7 +53,7 @@ class LeftPanels:
             self._introduction, self._front, self._ready = gui.add_html(""), gui.add_html(""), gui.add_html("")
             gui.add_html(glossary_html())
             self._card = gui.add_html("")
-        self._opening = ""
+        self._opening = self._of_step = self._asked = ""
         self._seen, self._changed = frozenset({"Yaw"}), changed
         touches.on("views", self._see)
         with _view(gui, views, "Yaw"):
@@ -113,11 +114,23 @@ class LeftPanels:
             self._opening = self._card.content = ""
         elif self._opening:
             summary, ending = opening_html(self._opening), f'<div style="opacity:.35">{ending}</div>'
-        front = front_html(picture.step.stage, picture.step.key)
+        self._of_step = front_of(picture.step.stage, picture.step.key) or self._of_step
+        front = front_html(self._of_step, self._asked)
         for widget, html in ((self._front, front), (self._summary, summary), (self._outcome, ending)):
             update_widget(widget, content=html)
         if not self._introduction.content:
             self._introduction.content = introduction_html(steps(run.trace))
+
+    @property
+    def tab(self) -> str:
+        """The view that a person has brought to the front, for the page's link."""
+        shown = [] if self._of_step in self._seen else [name for name in TABS[1:] if name in self._seen]
+        return shown[0] if shown else TABS[0]
+
+    def open_tab(self, tab: str) -> None:
+        """Bring a view to the front, once: then it is the person's to choose."""
+        if tab != TABS[0]:
+            self._asked = f"{tab} {1 + int(self._asked.partition(' ')[2] or 0)}"
 
     def begin_opening(self, label: str) -> None:
         """Until a run of this scene is shown, say that the panels still show the scene before."""
@@ -168,10 +181,14 @@ FRONTS = {
 """The view that goes with the steps of a stage."""
 
 
-def front_html(stage: str, key: str) -> str:
-    """Tells the page's script which view goes with a step."""
-    name = "Graph" if key.startswith("consensus-clique") else FRONTS.get(stage, "")
-    return f'<div hidden data-front="{name}"></div>'
+def front_of(stage: str, key: str) -> str:
+    """The view that goes with a step; empty if none does."""
+    return "Graph" if key.startswith("consensus-clique") else FRONTS.get(stage, "")
+
+
+def front_html(name: str, asked: str) -> str:
+    """Tells the page's script which view goes with a step, and what tab a link asked for."""
+    return f'<div hidden data-front="{name}" data-tab="{asked}"></div>'
 
 
 @contextmanager

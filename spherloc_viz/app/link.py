@@ -31,11 +31,13 @@ MAX_M, MIN_M = 1e7, 1e-6
 """Largest coordinate of a viewer, and least distance between a viewer and the point that it looks at."""
 THEMES = ("dark", "light")
 ANSWERS = ("told", "hidden")
+TABS = ("step's", "Yaw", "Graph", "Charts", "Residuals", "Images", "Matches")
+"""The tabs of the lower left panel, after the word for the one that goes with the step."""
 LISTS = ("spoil", "mend", "hide")
 """Keys of ``EDITS``, in their order."""
 ONCE = (
     *("v", "run", "scene", "case", "place", "seed", "query", "camera", *LISTS, "estimator"),
-    *("step", "select", "view", "theme", "answers"),
+    *("step", "select", "view", "theme", "answers", "tab"),
 )
 MANY = ("set", "option")
 
@@ -52,6 +54,7 @@ class PageView:
     answers_hidden: bool = False
     viewpoint: tuple[float, ...] = ()
     """The viewer's position (3), target (3), and field of view, degrees; empty for the step's own view."""
+    tab: str = TABS[0]
 
 
 def link_of(
@@ -83,6 +86,7 @@ def link_of(
         ("step", view.step),
         ("select", _numbers_text(view.selected)),
         ("view", ",".join(f"{number:.6g}" for number in view.viewpoint)),
+        ("tab", view.tab if view.tab != TABS[0] else None),
         ("theme", view.theme if view.theme != THEMES[0] else None),
         ("answers", ANSWERS[1] if view.answers_hidden else None),
     ]
@@ -266,7 +270,7 @@ def _view(said: dict[str, Any], view: PageView, opened: Opened | None, remarks: 
     except InputError as error:
         remarks.append(str(error))
     step = said.get("step", view.step if opened is None else "")
-    return PageView(step, selected, theme, hidden, viewpoint)
+    return PageView(step, selected, theme, hidden, viewpoint, _one_of(said, "tab", TABS, remarks))
 
 
 def _viewpoint(text: str) -> tuple[float, ...]:

@@ -308,17 +308,20 @@ class Session:
             self._edits.select(set(followed.view.selected) & set(self._run.kept.tolist()))
             key = _step_key(self._run.trace, followed)
             self._display.panels.steps.go(key)
+            self._display.panels.open_tab(followed.view.tab)
             if followed.view.viewpoint:
                 self._display.canvas.hold(key, followed.view.viewpoint)
         if followed.remarks:
             self.complain(" ".join(remark[:1].upper() + remark[1:] for remark in followed.remarks))
 
     def _view(self) -> PageView:
-        """Step, selection, viewer and hidden answers of the page, for its link."""
+        """Step, selection, viewer, hidden answers and tab of the page, for its link."""
         display, run = self._controls.display, self._run
         selected = () if run is None else tuple(run.kept[list(self._edits.places(run.kept))].tolist())
         viewpoint = self._display.canvas.viewpoint()
-        return PageView(self._display.step_key, selected, display.theme, display.answers_hidden, viewpoint)
+        return PageView(
+            self._display.step_key, selected, display.theme, display.answers_hidden, viewpoint, self._display.panels.tab
+        )
 
     def _open_linked(self, file: str) -> Opened:
         """Open the recording that a link names."""

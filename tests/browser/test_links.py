@@ -71,13 +71,14 @@ def test_a_reload_and_a_link_bring_back_what_is_shown(
     tab.tab("Matches")
     tab.row(7).click()
     tab.expect_card(7)
-    wanted = "set=outlier_rate%3D0.49&estimator=ransac-2p&option=iterations%3D321&step=bearings&select=7$"
+    wanted = "set=outlier_rate%3D0.49&estimator=ransac-2p&option=iterations%3D321&step=bearings&select=7&tab=Matches$"
     expect(tab.page).to_have_url(re.compile("&seed=4&" + wanted))
     link, before = tab.page.url, shown(tab)
     tab.page.reload()
     tab.expect_card(7)
     expect(tab.value("estimator")).to_have_text("ransac-2p")
     assert shown(tab) == before and tab.page.url == link
+    expect(tab.page.get_by_role("tab", name="Matches")).to_have_attribute("aria-selected", "true")
     tab.press("Undo")  # nothing was shown before the link
     assert tab.still(lambda: shown(tab), "the page stays") == before
 

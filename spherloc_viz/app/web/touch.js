@@ -7,7 +7,7 @@
 // shows its beginning.
 (() => {
   const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150, REVEAL_MS = 3000;
-  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, front = "", titled = null;
+  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, front = "", titled = null, asked = "";
   const fetched = new Set();
 
   function found(event) {
@@ -38,18 +38,27 @@
     tell(`views:${names}`, nowhere, { clientX: 0, clientY: 0, shiftKey: false }, { x: 0, y: 0 });
   }
 
+  // Tabs can be dragged, so that a click does nothing; Enter is what their own keys know.
+  function openTab(name) {
+    const tab = [...document.querySelectorAll("[role=tab]")].find((one) => one.textContent.trim() === name);
+    tab?.dispatchEvent(new KeyboardEvent("keydown", { key: "Enter", bubbles: true, cancelable: true }));
+  }
+
   // Brings the tab to the front that goes with the step, unless a person has left the one that went with the last.
   function followStep() {
     const wanted = document.querySelector("[data-front]")?.dataset.front ?? "", views = (seen ?? "").split(",");
     if (!wanted || wanted === front || seen === null) return;
     if (front === "" || views.includes(front)) {
-      if (!views.includes(wanted)) {
-        const tab = [...document.querySelectorAll("[role=tab]")].find((one) => one.textContent.trim() === wanted);
-        // Tabs can be dragged, so that a click does nothing; Enter is what their own keys know.
-        tab?.dispatchEvent(new KeyboardEvent("keydown", { key: "Enter", bubbles: true, cancelable: true }));
-      }
+      if (!views.includes(wanted)) openTab(wanted);
     }
     front = wanted;
+  }
+
+  // Brings the tab to the front that a link asked for, "NAME NUMBER": as if a person had chosen it there.
+  function followLink() {
+    const wanted = document.querySelector("[data-tab]")?.dataset.tab ?? "";
+    if (wanted !== asked && seen !== null) openTab(wanted.split(" ")[0]);
+    if (seen !== null) asked = wanted;
   }
 
   function reveal() {
@@ -157,7 +166,7 @@
     const nowhere = { left: 0, top: 0, width: 1, height: 1 };
     tell(detail, nowhere, { clientX: 0, clientY: 0 }, { x: 0, y: 0 });
   });
-  setInterval(() => { look(); followStep(); showStep(); reveal(); fetchFiles(); }, LOOK_EVERY_MS);
+  setInterval(() => { look(); followStep(); followLink(); showStep(); reveal(); fetchFiles(); }, LOOK_EVERY_MS);
 
   addEventListener("keydown", (event) => {
     const writing = event.target instanceof Element
