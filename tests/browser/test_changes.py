@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 import viser
 from playground import BLIND, PATIENCE_MS, SIZE
@@ -294,3 +295,27 @@ def test_a_handle_stays_where_it_was_dragged(page: Page, stage: Stage) -> None:
     assert page.evaluate(read, HANDLE) == [3.0, 0, 0]
     put_handle(desk.handle, (1, 0, 0, 0), (4.0, 0, 0))
     until(page, lambda: page.evaluate(read, HANDLE) == [4.0, 0, 0], "an answer moves it")
+
+
+def test_a_viewer_that_moves_sees_in_the_same_frame_what_was_sent_with_it(page: Page, stage: Stage) -> None:
+    """Without a graphics card a frame takes a second, in which the old objects would stand in the new view."""
+    (desk,) = stage.desks
+    page.evaluate(
+        """() => {
+            const {scene, nodeRefFromName} = window.__viserMutable;
+            window.__frames = [];
+            scene.onBeforeRender = (renderer, drawn, camera) => {
+                let corners = 0;
+                nodeRefFromName["/thing"]?.traverse(one => { corners ||= one.geometry?.attributes.position.count ?? 0; });
+                window.__frames.push([Math.round(camera.position.length()), corners]);
+            };
+        }"""
+    )
+    for size in range(5, 15):
+        corners, camera = np.random.default_rng(size).normal(size=(size, 3)), desk.client.camera
+        with desk.client.atomic():
+            camera.position, camera.look_at = (0.0, 0.0, -float(size)), (0.0, 0.0, 0.0)
+            desk.client.scene.add_mesh_simple("/thing", corners.astype(np.float32), np.array([[0, 1, 2]], np.uint32))
+        until(page, lambda size=size: page.evaluate("window.__frames.at(-1)") == [size, size], f"view {size} is drawn")
+    frames = page.evaluate("window.__frames")
+    assert [frame for frame in frames if frame[1] != frame[0] > 5] == []

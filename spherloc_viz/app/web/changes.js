@@ -37,6 +37,8 @@
         data.messages = data.messages.filter((message) => this.#keep(message));
         this.release();
       });
+      // Only then has viser's page set its own handler, after which this one is called.
+      queueMicrotask(() => this.addEventListener("message", ({ data }) => showTogether(data)));
     }
 
     postMessage(data, ...words) {
@@ -143,6 +145,13 @@
       if (updates) message.updates = Object.fromEntries(Object.entries(updates).filter(([key]) => key !== "answers"));
       return true;
     }
+  }
+
+  // viser's page takes messages in its next frame, which moves the viewer at once and still has the objects of before:
+  // React changes them after it. Messages that move the viewer are taken now, so that one frame shows all.
+  function showTogether({ type, messages }) {
+    if (type !== "message_batch" || !messages.some((message) => message.type.startsWith("SetCamera"))) return;
+    window.__viserMutable?.drainMessageQueue?.();
   }
 
   // What a message gives a value or a pose to; null if it gives none.
