@@ -306,7 +306,8 @@ def test_a_viewer_that_moves_sees_in_the_same_frame_what_was_sent_with_it(page: 
             window.__frames = [];
             scene.onBeforeRender = (renderer, drawn, camera) => {
                 let corners = 0;
-                nodeRefFromName["/thing"]?.traverse(one => { corners ||= one.geometry?.attributes.position.count ?? 0; });
+                const count = one => { corners ||= one.geometry?.attributes.position.count ?? 0; };
+                nodeRefFromName["/thing"]?.traverse(count);
                 window.__frames.push([Math.round(camera.position.length()), corners]);
             };
         }"""
