@@ -76,7 +76,8 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
             announce(f"compiling the solvers, {how_often}: {_expected(cold)} …")
         if _processors() > 1:
             # The rest of the fastest estimator is compiled here, before another process would have started.
-            _compile_in_order([part for part in cold if not part.startswith(FASTEST)])
+            apart = [part for part in cold if not part.startswith(FASTEST)]
+            _compile_in_order(apart, told=lambda done: announce and announce(f"{done} of {len(cold)} parts compiled"))
     for part, run in runs.items():
         try:
             run()
@@ -196,18 +197,27 @@ def _runs(estimator: str) -> dict[str, Callable[[], object]]:
     return runs
 
 
-def _compile_in_order(parts: Sequence[str], stopped: Callable[[], bool] = lambda: False, niceness: int = 0) -> None:
-    """Compile parts in processes of their own, first those that all estimators share.
+def _compile_in_order(
+    parts: Sequence[str],
+    stopped: Callable[[], bool] = lambda: False,
+    niceness: int = 0,
+    told: Callable[[int], object] = lambda done: None,
+) -> None:
+    """Compile parts in processes of their own, first those that all estimators share; ``told`` is how many are done.
 
     A part that fails there is compiled later where it is needed, and the error is raised then.
     """
-    _compile_at_once([part for part in parts if part in SHARED], stopped, niceness)
-    _compile_at_once([part for part in parts if part not in SHARED], stopped, niceness)
+    shared = [part for part in parts if part in SHARED]
+    _compile_at_once(shared, stopped, niceness, told)
+    own = [part for part in parts if part not in SHARED]
+    _compile_at_once(own, stopped, niceness, lambda done: told(len(shared) + done))
 
 
-def _compile_at_once(parts: Sequence[str], stopped: Callable[[], bool], niceness: int) -> None:
+def _compile_at_once(
+    parts: Sequence[str], stopped: Callable[[], bool], niceness: int, told: Callable[[int], object]
+) -> None:
     """Compile parts in processes of their own, as many at once as there are processors."""
-    lanes = min(MAX_PROCESSES, _processors())
+    lanes, done = min(MAX_PROCESSES, _processors()), 0
     waiting, running = deque(parts), []
     try:
         while (waiting or running) and not stopped():
@@ -217,6 +227,9 @@ def _compile_at_once(parts: Sequence[str], stopped: Callable[[], bool], niceness
                 running.append(subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing))
             time.sleep(0.02)
             running = [process for process in running if process.poll() is None]
+            if len(parts) - len(waiting) - len(running) > done:
+                done = len(parts) - len(waiting) - len(running)
+                told(done)
     except OSError:
         return
     finally:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from spherloc.warm_up import warm_up
+from spherloc.warm_up import _compile_in_order, warm_up
 from tests.waiting import LIMIT_S
 
 SCRIPT = """
@@ -18,7 +18,7 @@ from spherloc import registry
 from spherloc.diagnosis import diagnose
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.estimators import estimate
-from spherloc.warm_up import warm_up
+from spherloc.warm_up import _compile_in_order, warm_up
 
 def compiled():
     found = {}
@@ -53,7 +53,7 @@ def test_a_cold_start_is_announced_and_a_warm_one_is_not(tmp_path: Path) -> None
     # Ctrl-C ends it, even if whoever started these tests ignores it.
     script = """
 import signal
-from spherloc.warm_up import warm_up
+from spherloc.warm_up import _compile_in_order, warm_up
 signal.signal(signal.SIGINT, signal.default_int_handler)
 warm_up(lambda sentence: print(sentence, flush=True))"""
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
@@ -75,3 +75,10 @@ def test_a_part_that_is_compiled_in_a_process_of_its_own(part: str) -> None:
     """It failed in silence, and everything was compiled by one process."""
     done = subprocess.run([sys.executable, "-m", "spherloc.warm_up", part, "0"], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_who_waits_is_told_how_many_parts_are_done() -> None:
+    """Also of one that fails, which is compiled later where it is needed."""
+    told: list[int] = []
+    _compile_in_order(["search", "no such part"], told=told.append)
+    assert told == [1, 2]
