@@ -26,21 +26,22 @@ def as_python(
     changes, recorded = _written_changes(variation), is_recording(scene_path)
     given = ", ".join(f"{name}={_code(value)}" for name, value in changes.items())
     chosen = [str(seed)] if query is None else [str(seed), _code(query)]
-    options_given = ", ".join(f"{name}={_code(value)}" for name, value in _changed(scene_path, estimator, options))
+    options_given = ", ".join(
+        f"{_code(name)}: {_code(value)}" for name, value in _changed(scene_path, estimator, options)
+    )
+    file = _code(_written(scene_path))
     lines = [
-        "from pathlib import Path",
-        "",
-        *([] if recorded else ["from spherloc.datasets import load_scene"]),
+        *(["from pathlib import Path", ""] if recorded else []),
+        "import spherloc",
         *(["from spherloc.datasets.variation import Variation"] if changes else []),
-        f"from spherloc.estimators import {'estimate, options_type' if options_given else 'estimate'}",
         *(["from spherloc_viz.recording.replay import load_recorded_scene"] if recorded else []),
         "",
-        f"scene = {'load_recorded_scene' if recorded else 'load_scene'}(Path({_code(_written(scene_path))}))",
+        f"scene = load_recorded_scene(Path({file}))" if recorded else f"scene = spherloc.load_scene({file})",
         f"problem = Variation({given}).problem(scene, {', '.join(chosen)})"
         if changes
         else f"problem = scene.problem({', '.join(chosen)})",
-        *([f"options = options_type({_code(estimator)})({options_given})"] if options_given else []),
-        f"trace = estimate(problem, {_code(estimator)}, {'options, ' if options_given else ''}seed={seed})",
+        f"trace = spherloc.estimate(problem, {_code(estimator)}, "
+        f"{f'{{{options_given}}}, ' if options_given else ''}seed={seed})",
         "print(trace.message)",
         "print(None if trace.cam_from_map is None else trace.cam_from_map.tolist())",
     ]
@@ -90,20 +91,16 @@ def _written(path: Path) -> str:
 def _changed(scene_path: Path, estimator: str, options: Any) -> list[tuple[str, Any]]:
     """Options that are not what the estimator would take for the scene."""
     kind = options_type(estimator)
+    pairs = [(item.name, getattr(options, item.name)) for item in fields(options)]
     if is_recording(scene_path):
         # Its problem may state a bound, which is not known here: what is named is right in either case.
-        pairs = [(item.name, getattr(options, item.name)) for item in fields(options)]
         return [(name, value) for name, value in pairs if name == "bound_px" or value != getattr(kind(), name)]
     try:
         stated = scene_file.bound_px(scene_file.read_table(scene_path), str(scene_path))
     except InputError:
         stated = None
     default = kind() if stated is None else kind(bound_px=stated)
-    values = [(item.name, getattr(options, item.name), getattr(default, item.name)) for item in fields(options)]
-    named = [(name, value) for name, value, usual in values if value != usual]
-    if named and stated is not None and "bound_px" not in dict(named):
-        named.insert(0, ("bound_px", options.bound_px))  # a script that names options starts from the estimator's own
-    return named
+    return [(name, value) for name, value in pairs if value != getattr(default, name)]
 
 
 def _code(value: Any) -> str:

@@ -107,12 +107,13 @@ def test_only_what_differs_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     script = as_python(*plain)
     assert "Variation" not in script and "options" not in script
     assert (
-        'load_scene(Path("scenes/panorama_outliers_80.toml"))' in script and 'estimate(problem, "mc", seed=5)' in script
+        'spherloc.load_scene("scenes/panorama_outliers_80.toml")' in script
+        and 'spherloc.estimate(problem, "mc", seed=5)' in script
     )
     changed = (PANORAMA, 5, None, Variation(outlier_rate=0.9), "ransac-2p", options_type("ransac-2p")(iterations=50))
     assert as_command(*changed).endswith("--set outlier_rate=0.9 --seed 5 --estimator ransac-2p --option iterations=50")
     assert "Variation(outlier_rate=0.9).problem(scene, 5)" in as_python(*changed)
-    assert 'options_type("ransac-2p")(iterations=50)' in as_python(*changed)
+    assert 'estimate(problem, "ransac-2p", {"iterations": 50}, seed=5)' in as_python(*changed)
 
 
 @pytest.mark.parametrize("folder", [ROOT, ROOT / "scenes", ROOT / "docs"])

@@ -42,7 +42,7 @@ class Scene(Protocol):
         ...
 
 
-def load_scene(path: Path) -> Scene:
+def load_scene(path: str | Path) -> Scene:
     """Read a scene file.
 
     Raises ``InputError``, in one sentence with the file's name, if it is missing, unreadable, or has a wrong key.
