@@ -360,7 +360,7 @@ def test_matches_are_selected_and_changed_by_hand(house: House) -> None:
     before = session._run
     press("spoil:")
     until(lambda: session._run is not before and variation().spoiled == (3, 5, 7))
-    until(lambda: "3 spoiled" in session._controls._edits.content)
+    until(lambda: "3 made wrong" in session._controls._edits.content)
     press("select:5")
     press("hide:")
     until(lambda: variation().hidden == (5,) and session._run is not None and len(session._run.trace.problem) == 19)
