@@ -178,10 +178,10 @@ def test_matches_are_spoiled_mended_hidden_and_all_is_undone(tab: Playground, tr
     tab.row(inlier).click()
     spoiled = changed_outcome(tab, tab.touch("spoil:").click)
     assert spoiled["inliers"] == f"{count - 1} of 40"
-    expect(by_hand).to_contain_text("1 spoiled")
+    expect(by_hand).to_contain_text("1 made wrong")
     mended = changed_outcome(tab, tab.touch("mend:").click)
     assert mended["inliers"] == f"{count} of 40" and mended != first
-    expect(by_hand).to_contain_text("1 mended")
+    expect(by_hand).to_contain_text("1 made right")
 
     tab.press("Undo")
     expect_outcome(tab, spoiled)
