@@ -14,6 +14,7 @@ import pytest
 from spherloc.datasets.variation import Variation
 from spherloc.errors import RecordingError
 from spherloc.estimators import default_options, estimate
+from spherloc.trace import Trace
 from spherloc_viz.app import session as session_module
 from spherloc_viz.app.catalog import MAX_BRIEF, Catalog, Run, RunRequest, SceneRequest
 from spherloc_viz.app.page_runs import LOOK_S, PageRuns
@@ -111,6 +112,28 @@ def test_a_run_is_recorded_with_its_origin_and_opened_exactly(office: Office) ->
     until(lambda: not visitor.drawn["recorded/0"][0].visible)
     visitor.touch("run-close:")
     until(lambda: not visitor.card._html.visible and visitor.card.opened is None)
+
+
+def test_nothing_is_compared_before_the_page_shows_the_recorded_run(
+    office: Office, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run that the page still shows is another one, and was not made by changing the recorded one."""
+    visitor, first, _ = recorded_twice(office)
+    gate, session = threading.Event(), visitor.session
+
+    def later(*words: Any) -> Trace:
+        assert gate.wait(LIMIT_S)
+        return estimate(*words)
+
+    monkeypatch.setattr(session_module, "estimate", later)
+    visitor.see()
+    until(lambda: f"run-open:{first}" in visitor.rows)
+    visitor.touch(f"run-open:{first}")
+    until(lambda: "The page still shows another run." in visitor.card._html.content)
+    assert "runs-beside" not in visitor.card._html.content and "Changed" not in visitor.card._html.content
+    gate.set()
+    until(lambda: session._run is not None and session._run.request.scene.variation == Variation())
+    until(lambda: "another run" not in visitor.card._html.content)
 
 
 def test_labels_are_stored_and_seen_by_others(office: Office) -> None:

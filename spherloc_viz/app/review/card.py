@@ -50,15 +50,18 @@ def said_html(sentence: str, wrong: bool) -> str:
     return f'<div style="{look};padding-top:.2em;overflow-wrap:anywhere">{escape(sentence)}</div>' if sentence else ""
 
 
-def card_html(opened: Opened, run: Run, diagnosis: Diagnosis | None, bar: str) -> str:
-    """The whole card: the run as it was recorded, and as soon as it is changed, a table of both."""
+def card_html(opened: Opened, run: Run, diagnosis: Diagnosis | None, bar: str, reached: bool) -> str:
+    """The whole card: the run as it was recorded, and as soon as it is changed, a table of both. ``reached`` says
+    whether the page has shown the recorded run: until then its own run is another one and no change."""
     row = opened.recorded.row
     is_it = run.request == opened.request
+    if not reached:
+        return _card([bar, _title(words.title_of(row), row), _result(row), _dim("The page still shows another run.")])
     body = _result(row) if is_it else two_columns_html(lines_of(row, run, diagnosis), "as recorded", "now")
     remark = _remark(opened, run, is_it)
     parts = [bar, _title(words.title_of(row), row), body, remark]
     if opened.sentence:
-        parts.append(f'<div style="{DIM}">{escape(opened.sentence)}</div>')
+        parts.append(_dim(opened.sentence))
     parts.append(_ways(row, run if is_it else None))
     return _card(parts)
 
@@ -89,7 +92,7 @@ def _result(row: RunRow) -> str:
     facts = [f"{row.inliers}/{row.correspondences}", *([errors] if errors != words.UNKNOWN else [])]
     told = "".join(f' · <span style="white-space:nowrap">{fact}</span>' for fact in facts)
     line = f'{verdict_html(row)}<span style="{DIM}">{told}</span>'
-    return f'<div>{line}</div><div style="{DIM}">{escape(row.summary)}</div>'
+    return f"<div>{line}</div>{_dim(row.summary)}"
 
 
 def lines_of(row: RunRow, run: Run, diagnosis: Diagnosis | None) -> list[Line]:
@@ -142,6 +145,10 @@ def _remark(opened: Opened, run: Run, is_it: bool) -> str:
     if not is_it:
         fields = sorted(name.replace("_", " ") for name in changed_fields(opened.request, run.request))
         sentence = f"Changed: {', '.join(fields)}.{' The pose is the same.' if same else ''}"
+    return _dim(sentence)
+
+
+def _dim(sentence: str) -> str:
     return f'<div style="{DIM}">{escape(sentence)}</div>'
 
 

@@ -35,6 +35,8 @@ class ReviewCard:
         self._lock = threading.Lock()
         self._where: tuple[int | None, int] = (None, 0)
         self._said = ("", False)
+        self._reached: Path | None = None
+        """File of the recorded run that the page has shown."""
 
     @property
     def opened(self) -> Opened | None:
@@ -44,7 +46,7 @@ class ReviewCard:
     def show(self, opened: Opened | None) -> None:
         """Show another run, or none."""
         with self._lock:
-            self._opened = opened
+            self._opened, self._reached = opened, None
         self._redraw()
 
     def amend(self, change: Callable[[Opened], Opened]) -> None:
@@ -76,7 +78,10 @@ class ReviewCard:
         opened, html = self._opened, ""
         if opened is not None:
             bar = bar_html(*self._where) + said_html(*self._said)
-            html = untold_html(opened, run, bar) if hidden else card_html(opened, run, diagnosis, bar)
+            if run.request == opened.request:
+                self._reached = opened.path
+            reached = self._reached == opened.path
+            html = untold_html(opened, run, bar) if hidden else card_html(opened, run, diagnosis, bar, reached)
         update_widget(self._html, content=html)
         self._html.visible = bool(html)
 
