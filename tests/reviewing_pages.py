@@ -60,6 +60,7 @@ class Office:
         self.sessions.close()
         stop_viser(self.server)
         self.recorder.close()
+        self.services.downloads.close()
         assert not self.errors
 
 
