@@ -9,6 +9,7 @@ the largest bound among its tasks is what is proven.
 
 import os
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import repeat
@@ -46,6 +47,8 @@ FIRST_EFFORT = 100_000
 TASK_EFFORT, TASK_ROUNDS = 400_000, 400
 """Least effort of a task, and its effort for each match: starting one again costs a test of every match."""
 TASKS_A_ROUND = 8
+SLOW_EFFORT = 5_000_000
+"""Tests after which another start is asked for: most problems need fewer."""
 MAX_SPLITS = 2000
 """Boxes that each task keeps for the picture, ..."""
 MAX_KEPT = 20_000
@@ -53,6 +56,9 @@ MAX_KEPT = 20_000
 NEAR_TURN_RAD, NEAR_SHARE, NEAR_GAP, NEAR_EFFORT = 2e-3, 4e-3, 0.01, 60
 """The cell around the first guess: half sides of its turns, rad, and of its position, of the median distance; what may
 be missed there, of all matches; tests for each match."""
+
+Start = tuple[FloatArray, int]
+"""A pose (3, 4) between the aligned frames, within the gravity bound, and how many matches it explains."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,18 +90,18 @@ class PositionSearch:
 def search_positions(
     aligned: AlignedProblem,
     matches: PackedMatches,
-    start: tuple[FloatArray, int] | None,
+    start: Start | None,
     effort: int,
     deadline: float,
     yaw_bound: NDArray[np.int32] | None = None,
     watch: Watch | None = None,
+    another: Callable[[], Start | None] | None = None,
 ) -> PositionSearch:
     """Search all poses within the gravity bound for one that explains more matches than ``start`` does.
 
-    ``matches`` is that of ``pack_matches``. ``start`` is a pose (3, 4) between the aligned frames, within the gravity
-    bound, and what it explains. After ``effort`` tests or at ``deadline`` (``working_s``) the search stops.
+    ``matches`` is that of ``pack_matches``. After ``effort`` tests or at ``deadline`` (``working_s``) the search stops.
     ``yaw_bound`` (BINS,) bounds what poses explain by bin of turn, if anything is known. ``watch`` counts the tests;
-    raises ``Cancelled``.
+    raises ``Cancelled``. ``another`` is called once if the search takes long, for a better start.
     """
     watch = watch or Watch()
     watch.expect(effort)
@@ -103,7 +109,7 @@ def search_positions(
     if working_s() < deadline:
         search.around_start(effort)
         search.first(min(FIRST_EFFORT, effort))
-        search.rounds(effort, deadline)
+        search.rounds(effort, deadline, another)
     watch.check()
     return PositionSearch(search.pose(), search.best, search.upper(), search.effort, *search.boxes())
 
@@ -132,7 +138,7 @@ class _Search:
         self,
         aligned: AlignedProblem,
         matches: PackedMatches,
-        start: tuple[FloatArray, int] | None,
+        start: Start | None,
         yaw_bound: NDArray[np.int32] | None,
         watch: Watch,
     ) -> None:
@@ -146,9 +152,7 @@ class _Search:
         self._halted = False
         self._splits: list[tuple[FloatArray, FloatArray, NDArray[np.int32]]] = []
         self._kept = 0
-        if start is not None:
-            chart, at = parameters_of(self.matches, start[0])
-            self.best_at, self.best = np.array([chart, *at]), start[1]
+        self.take_start(start)
         lower, upper = whole_domain(self.gravity_bound_rad)
         about = np.array([[chart, self.count, 0] for chart in range(len(lower))], np.int64)
         self.lower, self.upper_ends, self.about = lower, upper, about
@@ -182,6 +186,12 @@ class _Search:
     def upper(self) -> int:
         """What is proven so far."""
         return max(self.best, self.open, int(self.about[:, 1].max(initial=0)))
+
+    def take_start(self, start: Start | None) -> None:
+        """Search for more than a pose explains from now on, if that is better than the best one."""
+        if start is not None and start[1] > self.best:
+            chart, at = parameters_of(self.matches, start[0])
+            self.best_at, self.best = np.array([chart, *at]), start[1]
 
     def around_start(self, effort: int) -> None:
         """Look for better poses near the start."""
@@ -228,8 +238,11 @@ class _Search:
         self.lower = self.upper_ends = np.empty((0, AXES))
         self._take_left([worker])
 
-    def rounds(self, effort: int, deadline: float) -> None:
-        """Search tasks, round by round, until none is left, as many tests are done, or it is as late."""
+    def rounds(self, effort: int, deadline: float, another: Callable[[], Start | None] | None) -> None:
+        """Search tasks, round by round, until none is left, as many tests are done, or it is as late.
+
+        ``another`` is called once, for a better start, if the search takes long.
+        """
         if len(self.about) == 0 or self.effort >= effort:
             return
         self._workers += [_Worker(self.count) for _ in range(TASKS_A_ROUND - 1)]
@@ -242,6 +255,9 @@ class _Search:
                 while len(self.about) and self.effort < effort and not self._halted:
                     self.watch.board[DONE] = self.effort
                     self.watch.check()
+                    if another is not None and self.effort >= SLOW_EFFORT:
+                        self.take_start(another())
+                        another = None
                     order = np.argsort(-self.about[:, 1], kind="stable")
                     now, later = order[:TASKS_A_ROUND], order[TASKS_A_ROUND:]
                     workers = self._workers[: len(now)]

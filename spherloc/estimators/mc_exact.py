@@ -26,6 +26,7 @@ from spherloc.geometry import level_poses, pose, yaw_of, yaw_rotation
 from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, matches_of, residuals_px
+from spherloc.solvers.two_point import two_point
 from spherloc.trace import Certificate, ConsensusStage, PositionStage, Stage
 from spherloc.types import FloatArray
 from spherloc.watch import working_s
@@ -45,6 +46,9 @@ FIRST_STARTS = 3
 FIRST_BOUNDS, ROUNDS_PER_BOUND, STEPS_PER_ROUND = 5, 2, 10
 """Of their fits: bounds from the widened one to that of the noise, choices of inliers at each, and steps on each
 choice."""
+MAX_PAIR_STARTS, PAIR_STARTS_EFFORT = 100, 5000
+"""Pairs whose 2P poses are tried where the search takes long and gravity is uncertain: the most, and the most matches
+that all of them are fitted to."""
 YAW_BINS = 1440
 MAX_LEVELS, MAX_BOXES = 12, 200
 """Of the boxes that are kept for the picture."""
@@ -176,6 +180,7 @@ def _search(
         deadline,
         yaw_bound,
         clock.watch,
+        lambda: _another(aligned, bounds, matches, guess),
     )
     upper = found.upper if pairs is None else min(found.upper, int(pairs.bound.max(initial=1)))
     return _Found(found.pose, upper, pairs, effort + found.effort, _boxes(found))
@@ -284,6 +289,28 @@ def first_pose(
     counts = [supported(aligned, one, bounds.noise_px) for one in poses]
     most = int(np.argmax(counts))
     return (poses[most], counts[most]) if counts[most] > 1 else None
+
+
+def _another(
+    aligned: AlignedProblem, bounds: Bounds, matches: PackedMatches, guess: TwoPointSearch
+) -> tuple[FloatArray, int] | None:
+    """The best of the robust fits to 2P poses of pairs that the guess explains, where gravity is uncertain: a pose
+    (3, 4) within the gravity bound, and what it explains."""
+    most = min(MAX_PAIR_STARTS, PAIR_STARTS_EFFORT // len(aligned.points))
+    if aligned.gravity_bound_rad == 0.0 or not guess.found or most == 0:
+        return None
+    ((yaw, translation),) = _poses(guess)
+    members = np.flatnonzero(residuals_px(aligned, pose(yaw_rotation(yaw), translation)) <= bounds.pixels)
+    pairs = np.random.default_rng(0).choice(members, (most, 2))
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    yaws, translations, exists = two_point(aligned.bearings[pairs], aligned.points[pairs])
+    best = None
+    for level in level_poses(yaws[exists], translations[exists]):
+        for tilted in _narrowed(aligned, bounds, matches, level):
+            count = supported(aligned, tilted, bounds.noise_px)
+            if best is None or count > best[1]:
+                best = tilted, count
+    return best
 
 
 def within_gravity(matches: PackedMatches, cam_from_map: FloatArray, gravity_bound_rad: float) -> FloatArray:
