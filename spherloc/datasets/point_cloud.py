@@ -28,11 +28,14 @@ AHEAD_DRAWS = 60
 def sees(camera: Camera, pixels: FloatArray, field_of_view_deg: float = WHOLE_SPHERE_DEG) -> BoolArray:
     """Which pixels (N, 2) are in the image, valid for the model, and within half the field of view from its axis."""
     bearings, valid = camera.unproject(pixels)
-    visible = in_image(camera, pixels) & valid
-    if field_of_view_deg < WHOLE_SPHERE_DEG:
-        angle = np.arctan2(np.hypot(bearings[:, 0], bearings[:, 1]), bearings[:, 2])
-        visible &= angle <= np.radians(0.5 * field_of_view_deg)
-    return visible
+    return in_image(camera, pixels) & valid & _within(bearings, field_of_view_deg)
+
+
+def _within(rays: FloatArray, field_of_view_deg: float) -> BoolArray:
+    """Which rays (N, 3) of any length are within half the field of view from the optical axis; not NaN."""
+    if field_of_view_deg >= WHOLE_SPHERE_DEG:
+        return np.ones(len(rays), dtype=bool)
+    return np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]) <= np.radians(0.5 * field_of_view_deg)
 
 
 @dataclass(frozen=True)
@@ -50,10 +53,9 @@ class Lens:
 
     def project(self, cam_from_map: FloatArray, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Pixels (N, 2) of points (N, 3) from a pose (3, 4), and which of them (N,) it sees."""
-        pixels, visible = self.camera.project(transform(cam_from_map, points))
-        visible = visible & in_image(self.camera, pixels)
-        visible[visible] = self.sees(pixels[visible])
-        return pixels, visible
+        rays = transform(cam_from_map, points)
+        pixels, valid = self.camera.project(rays)
+        return pixels, valid & in_image(self.camera, pixels) & _within(rays, self.field_of_view_deg)
 
 
 def _coordinates(rng: np.random.Generator, count: int, draws: Draws) -> FloatArray:
