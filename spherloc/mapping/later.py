@@ -173,9 +173,19 @@ def _image_in(pycolmap: Any, made: Reconstruction, number: int) -> int:
 
 
 def adjusted(pycolmap: Any, model: Any) -> None:
-    """Bundle adjustment of poses and points; the camera stays as it is."""
+    """Bundle adjustment of poses and points; the camera stays as it is.
+
+    It does what ``pycolmap.bundle_adjustment`` does, which would set COLMAP's level of logging back to its default, so
+    that this and all later steps print lines of their own.
+    """
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_extra_params = options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = 1
-    pycolmap.bundle_adjustment(model, options)
+    pycolmap.ObservationManager(model).filter_observations_with_negative_depth()
+    images = pycolmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        images.add_image(number)
+    images.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, images, model).solve()
+    model.update_point_3d_errors()
