@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.panorama_tags import down_of, gravity_from_tags
 from spherloc.errors import InputError
 from spherloc.frontend.view import View
+from spherloc.geometry import so3_exp
 
 CAMERA = Equirectangular(64, 32)
 HEAD = (
@@ -24,8 +26,17 @@ def attributes(text):
 
 def view(folder, packet=None, suffix="jpg"):
     path = folder / f"a.{suffix}"
-    Image.new("RGB", (64, 32)).save(path, **({} if packet is None else {"xmp": packet.encode()}))
+    Image.new("RGB", (64, 32)).save(path, **({} if packet is None else tagged(packet, suffix)))
     return View(path.name, CAMERA, path)
+
+
+def tagged(packet, suffix):
+    """What Pillow is told to write an XMP packet where the format has it."""
+    if suffix == "png":
+        info = PngInfo()
+        info.add_itxt("XML:com.adobe.xmp", packet)
+        return {"pnginfo": info}
+    return {"tiffinfo": {700: packet.encode()}} if suffix == "tif" else {"xmp": packet.encode()}
 
 
 def test_pitch_and_roll_turn_down_as_they_say():
@@ -37,25 +48,42 @@ def test_pitch_and_roll_turn_down_as_they_say():
     np.testing.assert_allclose(down_of(0.0, np.pi / 2), [1, 0, 0], atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    "packet",
-    [
-        attributes('GPano:PosePitchDegrees="-4.5" GPano:PoseRollDegrees="2"'),
-        f"{HEAD}<rdf:Description {SPACE}><GPano:PosePitchDegrees> -4.5</GPano:PosePitchDegrees>"
-        f"<GPano:PoseRollDegrees>2.0</GPano:PoseRollDegrees></rdf:Description>{TAIL}",
-    ],
-    ids=["attributes", "elements"],
+def test_pitch_and_roll_together_are_those_of_the_specification():
+    """Pitch, "measured in degrees above the horizon, for the center in the image", turns the sphere about its axis to the
+    right; roll, with which "the horizon rotates counterclockwise in the image", before that about the one ahead."""
+    pitch, roll, heading = np.radians([-25.0, 40.0, 70.0])
+    turns = [[0.0, 0.0, -heading], [pitch, 0.0, 0.0], [0.0, roll, 0.0]]  # axes right, ahead and up
+    world_from_sphere = np.linalg.multi_dot([so3_exp(np.array(turn)) for turn in turns])
+    assert np.degrees(np.arcsin(world_from_sphere[2, 1])) == pytest.approx(-25.0)
+    right, ahead, up = world_from_sphere.T @ [0.0, 0.0, -1.0]
+    np.testing.assert_allclose(down_of(pitch, roll), [right, -up, ahead], atol=1e-12)
+
+
+ATTRIBUTES = attributes('GPano:PosePitchDegrees="-4.5" GPano:PoseRollDegrees="2"')
+ELEMENTS = (
+    f"{HEAD}<rdf:Description {SPACE}><GPano:PosePitchDegrees> -4.5</GPano:PosePitchDegrees>"
+    f"<GPano:PoseRollDegrees>2.0</GPano:PoseRollDegrees></rdf:Description>{TAIL}"
 )
-def test_both_ways_of_writing_them_are_read(tmp_path, packet):
-    found = gravity_from_tags(view(tmp_path, packet))
-    np.testing.assert_allclose(found.down, down_of(np.radians(-4.5), np.radians(2.0)))
+
+
+@pytest.mark.parametrize("packet", [ATTRIBUTES, ELEMENTS], ids=["attributes", "elements"])
+@pytest.mark.parametrize("suffix", ["jpg", "tif", "png"])
+def test_both_ways_of_writing_them_are_read(tmp_path, packet, suffix):
+    found = gravity_from_tags(view(tmp_path, packet, suffix))
+    np.testing.assert_allclose(found.down, [0.0347919, 0.9963101, 0.0784591], atol=1e-7)  # a little right and ahead
     assert found.source == "pitch and roll in the photograph's tags"
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "tif", "png"])
+def test_a_photograph_without_tags_is_named(tmp_path, suffix):
+    with pytest.raises(InputError) as caught:
+        gravity_from_tags(view(tmp_path, None, suffix))
+    assert str(caught.value) == f"a.{suffix}: has no XMP tags, which would hold its pitch and roll."
 
 
 @pytest.mark.parametrize(
     ("packet", "said"),
     [
-        (None, "a.jpg: has no XMP tags"),
         (attributes('GPano:ProjectionType="equirectangular"'), "hold no pitch and roll"),
         (attributes('GPano:PosePitchDegrees="up"'), "'up' is not a finite number"),
         (attributes('GPano:PosePitchDegrees="95"'), "PosePitchDegrees is 95.0; it must be an angle from -90 to 90"),
