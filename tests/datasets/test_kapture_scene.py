@@ -206,6 +206,31 @@ def test_points_come_from_rig_partners_first_and_from_ever_farther_away(tmp_path
     assert all(name.startswith("back") for name in lifts["back/5.jpg"]) and len(lifts["back/5.jpg"]) == 4
 
 
+def test_panoramas_that_look_back_are_partners_too(tmp_path):
+    """They see all around: every other one looks back, and one below another on a rig does; narrow images would not."""
+    sensors = "".join(f"{name}, , camera, EQUIRECTANGULAR, 640, 320, 640, 320\n" for name in ("top", "low"))
+    rigs = "robot, top, 1, 0, 0, 0, 0, 0, 0\nrobot, low, 0, 0, 1, 0, 0, -0.5, 0\n"
+    steps = range(10)
+    ahead, back = "1, 0, 0, 0, 0, 0", "0, 0, 1, 0, 0, 0"
+    trajectories = "".join(
+        f"{at}, robot, {back}, {at}\n" if at % 2 else f"{at}, robot, {ahead}, {-at}\n" for at in steps
+    )
+    records = [(step, name, f"{name}/{step}.jpg") for step in steps for name in ("top", "low")]
+    root = write_kapture(
+        tmp_path / "data",
+        [image for *_, image in records],
+        sensors=sensors,
+        rigs=rigs,
+        trajectories=trajectories,
+        records_camera="".join(f"{time}, {name}, {image}\n" for time, name, image in records),
+    )
+    scene = scene_of(tmp_path, root, 'queries = ["top/9.jpg"]\n[gravity]\nmap = [0, 1, 0]')
+    lifts = {view.name: names(view.lift.others) for view in scene.references}
+    partner, *others = lifts["top/0.jpg"]
+    assert partner == "low/0.jpg"
+    assert [int(name.split("/")[1][:-4]) for name in others] == [1, 2, 4, 8]
+
+
 @pytest.mark.parametrize("count", [1, 2])
 def test_few_references(tmp_path, count):
     root = write_kapture(

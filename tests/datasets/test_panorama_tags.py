@@ -49,8 +49,8 @@ def test_pitch_and_roll_turn_down_as_they_say():
 
 
 def test_pitch_and_roll_together_are_those_of_the_specification():
-    """Pitch, "measured in degrees above the horizon, for the center in the image", turns the sphere about its axis to the
-    right; roll, with which "the horizon rotates counterclockwise in the image", before that about the one ahead."""
+    """Pitch, "measured in degrees above the horizon, for the center in the image", turns the sphere about its axis to
+    the right; roll, with which "the horizon rotates counterclockwise in the image", before that about the one ahead."""
     pitch, roll, heading = np.radians([-25.0, 40.0, 70.0])
     turns = [[0.0, 0.0, -heading], [pitch, 0.0, 0.0], [0.0, roll, 0.0]]  # axes right, ahead and up
     world_from_sphere = np.linalg.multi_dot([so3_exp(np.array(turn)) for turn in turns])
