@@ -51,7 +51,11 @@ def test_folders(tmp_path, names, said):
     [
         ("a.png", "is an image; make a map of all images of its folder with: spherloc map "),
         ("a.insv", "is a video; make a map of its frames with: spherloc map "),
-        ("a.vrs", "is a recording of Project Aria's glasses; save its images"),
+        (
+            "a.vrs",
+            "is a recording of Project Aria's glasses; save its images with projectaria-tools, in an environment of its own "
+            "because its version 2 needs another version of rerun, then make a map of their folder with: spherloc map ",
+        ),
         ("database.db", "is a COLMAP database"),
         ("matches.csv", "is a table; its matches are solved by a scene of kind correspondences"),
         ("camera.yaml", "is a YAML file; a calibration is named by the key 'calibration'"),
