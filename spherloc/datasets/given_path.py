@@ -31,8 +31,8 @@ _FILES = {
     ".ply": ("a point cloud or a mesh", "a scene of kind newer-college names it as prior_map"),
     ".vrs": (
         "a recording of Project Aria's glasses",
-        "save its images with projectaria-tools, in an environment of its own because its version 2 needs another version "
-        "of rerun, then make a map of their folder with: spherloc map FOLDER",
+        "save its images with projectaria-tools, in an environment of its own because its version 2 needs another "
+        "version of rerun, then make a map of their folder with: spherloc map FOLDER",
     ),
     ".json": ("a JSON file", "a calibration is named by the key 'calibration' of a scene file"),
     ".yaml": ("a YAML file", "a calibration is named by the key 'calibration' of a scene file"),
