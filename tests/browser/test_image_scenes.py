@@ -1,13 +1,17 @@
 """A scene made of images, as a user meets it: queries, matches on the photographs, the map's mesh, a whole sequence."""
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from playground import SELECTED, Playground, served
 from playwright.sync_api import Browser, expect
 
+from spherloc.datasets import bundled_scenes, load_scene
+from spherloc.datasets.map_scene import MapScene
 from spherloc_viz.recording.content.data import read_recording
 
 PANORAMA = """
@@ -175,4 +179,45 @@ def test_the_query_on_the_sphere_and_the_mesh_around_it(
     tab.until(lambda: visible("/sphere/image") and tab.node("/sphere/image") != panorama, "another image")
     tab.tab("Images")
     tab.until(lambda: photo(tab, "query")[0] == photo(tab, "query")[1], "a square photograph")
+    tab.expect_quiet(images_address[0])
+
+
+def write_photographs(folder: Path) -> None:
+    """Three panoramas of a square, 5.9 m apart."""
+    scene = load_scene(bundled_scenes()["campus_panorama"])
+    assert isinstance(scene, MapScene)
+    folder.mkdir()
+    for view in scene.references[2:5]:
+        view.make_file()
+        cv2.imwrite(str(folder / f"{view.name}.png"), view.read())
+
+
+def test_a_folder_of_photographs_becomes_a_map_and_opens(
+    images_tab: Playground, images_address: tuple[str, Path]
+) -> None:
+    """Chosen in an allowed folder; its queries, which are images of the map, stand in the strip with their pictures."""
+    tab, folder = images_tab, images_address[1].parent / "square"
+    write_photographs(folder)
+    inliers = tab.value("inliers").inner_text()
+    tab.tab("Open")
+    tab.touch("open-folder:0:0:").click()
+    tab.touch("open-folder:0:0:square").click()
+    stop = tab.page.get_by_role("button", name="Stop the map")
+    tab.touch("map-folder:0:square").click()
+    expect(tab.page.get_by_text(re.compile(r"^square: \d of \d (images|pairs of images) "))).to_be_visible()
+    expect(stop).to_be_visible()
+    expect(tab.page.get_by_text(re.compile(r"^in the map +3 of 3 images, "))).to_be_visible()
+    expect(stop).to_have_count(0)
+
+    scene = load_scene(folder.with_name("square_map") / "scene.toml")
+    assert isinstance(scene, MapScene)
+    tab.tab("Play")
+    expect(tab.widget("Scene")).to_have_value(scene.name)
+    expect(tab.value("inliers")).not_to_have_text(inliers)
+    expect(tab.value("outcome")).to_have_text("pose found, truth unknown")
+    queries = tab.page.get_by_role("list", name="Queries").get_by_role("button")
+    expect(queries).to_have_count(3)
+    assert [query.get_attribute("aria-label") for query in queries.all()] == [view.name for view in scene.queries]
+    sizes = queries.locator("img").evaluate_all("all => all.map(one => [one.naturalWidth, one.naturalHeight])")
+    assert sizes == [[104, 52]] * 3
     tab.expect_quiet(images_address[0])

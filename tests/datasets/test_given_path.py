@@ -53,8 +53,8 @@ def test_folders(tmp_path, names, said):
         ("a.insv", "is a video; make a map of its frames with: spherloc map "),
         (
             "a.vrs",
-            "is a recording of Project Aria's glasses; save its images with projectaria-tools, in an environment of its "
-            "own because its version 2 needs another version of rerun, then make a map of their folder with: spherloc map ",
+            "is a recording of Project Aria's glasses; save its images with projectaria-tools, in an environment of "
+            "its own because its version 2 needs another version of rerun, then make a map of their folder with: ",
         ),
         ("database.db", "is a COLMAP database"),
         ("matches.csv", "is a table; its matches are solved by a scene of kind correspondences"),
