@@ -145,8 +145,9 @@ install_python() {
   watch "$venv" -m pip install --disable-pip-version-check -e ".$extras" ||
     die "pip could not install the packages, for the reason above; mend that and try again."
   if [[ $target != @(lint|docs) ]]; then
-    say "compiling the solvers, once: one to two minutes"
-    "$venv" -c "from spherloc.warm_up import warm_up; warm_up(estimators=$([ "$target" = play ] && echo "['mc']" || echo None))" ||
+    "$venv" -c 'import sys; from spherloc.warm_up import warm_up
+warm_up(lambda words: print(f"spherloc: {words}", file=sys.stderr), sys.argv[1:] or None)' \
+      $([ "$target" != play ] || echo mc) ||
       die "the solvers could not be prepared, for the reason above; mend that and try again."
   fi
   printf '%s\n' "$state" >"$stamp$target"
