@@ -3,7 +3,8 @@
   const MANY = ["set", "option"], OPENING_MS = 90000;
   const prose = document.querySelector(".prose"), scene = openScene((numbers) => write(numbers));
   const moments = [...document.querySelectorAll("section")], where = document.querySelector(".where");
-  const changes = new Map();  // what the reader changed, by moment
+  // What the reader changed, by moment: the link or answer of the last press, and the controls moved since.
+  const followed = new Map(), moved = new Map();
   const light = matchMedia("(prefers-color-scheme: light)");
   let now = null, wanted = "", channel = null;
 
@@ -22,7 +23,8 @@
 
   function stateOf(moment) {
     const hidden = moment.dataset.before && !moment.classList.contains("answered");
-    const state = changed(hidden ? moment.dataset.before : moment.dataset.state, changes.get(moment) ?? "");
+    const base = hidden ? moment.dataset.before : moment.dataset.state;
+    const state = changed(changed(base, followed.get(moment) ?? ""), moved.get(moment) ?? "");
     return light.matches ? changed(state, "theme=light") : state;
   }
 
@@ -46,8 +48,20 @@
     control.nextElementSibling.textContent = percent ? `${Math.round(100 * control.value)} %` : control.value;
   }
 
-  function change(moment, more) {
-    changes.set(moment, changed(changes.get(moment) ?? "", more));
+  // A link says a state whatever link was pressed before, as in an exported lesson; controls it does not speak of stay.
+  function follow(moment, more) {
+    const said = parts(more), kept = [...parts(moved.get(moment) ?? "")].filter(([key]) => !said.has(key));
+    followed.set(moment, more);
+    moved.set(moment, text(kept));
+    see(moment);
+  }
+
+  function move(moment, more) {
+    moved.set(moment, changed(moved.get(moment) ?? "", more));
+    see(moment);
+  }
+
+  function see(moment) {
     if (moment !== now) enter(moment);
     go();
   }
@@ -91,9 +105,9 @@
     item.classList.add("told");
     item.querySelector("button").setAttribute("aria-expanded", "true");
     moment.classList.add("answered");
-    changes.set(moment, item.dataset.go ?? "");
-    if (moment !== now) enter(moment);
-    go();
+    followed.set(moment, item.dataset.go ?? "");
+    moved.delete(moment);
+    see(moment);
     report();
   }
 
@@ -143,7 +157,7 @@
     const button = event.target.closest("[data-press]");
     if (link) {
       event.preventDefault();
-      change(link.closest("section") ?? now, link.dataset.change);
+      follow(link.closest("section") ?? now, link.dataset.change);
     } else if (item) {
       const unanswered = !item.closest("section").classList.contains("answered");
       const counting = ["teacher", "voting"].some((name) => document.body.classList.contains(name));
@@ -158,7 +172,7 @@
     if (!key) return;
     const [many, name] = key.split(".");
     const more = new URLSearchParams([[many, name ? `${name}=${target.value}` : target.value]]);
-    change(target.closest("section"), more.toString());
+    move(target.closest("section"), more.toString());
   });
 
   addEventListener("keydown", (event) => {

@@ -49,6 +49,16 @@ def test_a_lesson_is_read(browser: Browser, address: str) -> None:
     frame = next(one for one in page.frames if one != page.main_frame)
     assert "outlier_rate%3D0.9" in frame.url and "step=outcome" in frame.url
     expect(cost.locator(".open a")).to_have_attribute("href", re.compile("outlier_rate%3D0.9"))
+
+    # A link says the same state whatever link was pressed before it.
+    page.goto(f"{address}/learn/failures#m5")
+    luck = page.locator("#moment-5")
+    luck.locator(".right button").click()
+    luck.get_by_role("link", name="Seed 0").click()
+    shown = luck.locator(".open a")
+    expect(shown).to_have_attribute("href", re.compile("seed=0.*iterations%3D200"))
+    luck.get_by_role("link", name="1,000 samples").click()
+    expect(shown).to_have_attribute("href", re.compile("seed=3.*iterations%3D1000"))
     assert errors == []
     context.close()
 
