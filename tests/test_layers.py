@@ -381,6 +381,20 @@ def test_ring_points_where_the_camera_looks(mc: Trace) -> None:
     np.testing.assert_allclose(ahead / np.linalg.norm(ahead), [0, 0, 1], atol=1e-9)
 
 
+def test_the_true_yaw_and_the_true_camera_are_in_view(mc: Trace) -> None:
+    """The lessons speak of them; the line of the true yaw is longer where another one hides it."""
+    truth = mc.problem.truth_cam_from_map
+    assert truth is not None
+    for step in ("yaw-pair", "yaw-roots"):
+        picture = at(mc, step)
+        spoke = item(picture, "ring/truth")
+        assert isinstance(spoke, Segments)
+        for end in spoke.points[0]:
+            assert np.any(np.all(picture.focus.points == end, axis=1)), step
+    seen = at(mc, "match").focus.points
+    assert np.all((seen.min(axis=0) < camera_centre(truth)) & (camera_centre(truth) < seen.max(axis=0)))
+
+
 def test_gold_arcs_cover_the_estimated_yaw(mc: Trace) -> None:
     """A ring drawn with the wrong ends would show an overlap that is not there."""
     picture, stage = at(mc, "yaw-clique"), mc.stage(YawStage)

@@ -3,7 +3,7 @@
 On the ring, the direction of a yaw is where the camera looks with that yaw.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from spherloc.geometry import wrap_angle, yaw_of
 from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers.frame import RunView, one_color
-from spherloc_viz.layers.primitives import Curve, Label, Segments
+from spherloc_viz.layers.primitives import Curve, Label, SceneItem, Segments
 
 FOOT = 2.05
 """Radius at which the outline has the height 0, in sphere radii."""
@@ -19,6 +19,10 @@ HEIGHT = 0.9
 """Height of the outline at its peak, in sphere radii."""
 END = FOOT + HEIGHT + 0.15
 """Radius at which lines through the ring end, in sphere radii."""
+BEYOND = END + 0.5
+"""Radius at which the line of the true yaw ends where another one would hide it, in sphere radii."""
+TRUTH = "ring/truth"
+"""Name of the line of the true yaw."""
 HIDES_RAD = np.radians(4.0)
 """Least angle between two lines that can be told apart."""
 DEGREES = 360
@@ -76,11 +80,22 @@ def spokes(
     out = [] if yaw_rad is None else [spoke("ring/estimate", view, centre, yaw_rad, style.ESTIMATE)]
     if view.truth is not None:
         true_rad = yaw_of(view.truth[:, :3])
-        others = np.array([*candidates_rad, *([] if yaw_rad is None else [yaw_rad])])
-        hides = np.any(np.cos(others - true_rad) > np.cos(HIDES_RAD))
-        begin, end = (END, END + 0.5) if hides else (1.0, END)
-        out.append(spoke("ring/truth", view, centre, true_rad, style.TRUTH, begin, end))
+        others = [*candidates_rad, *([] if yaw_rad is None else [yaw_rad])]
+        begin, end = (END, BEYOND) if _hides_truth(view, others) else (1.0, END)
+        out.append(spoke(TRUTH, view, centre, true_rad, style.TRUTH, begin, end))
     return out
+
+
+def _hides_truth(view: RunView, yaws_rad: Sequence[float]) -> bool:
+    """Whether the line of one of these yaws would hide that of the true one."""
+    if view.truth is None:
+        return False
+    return bool(np.any(np.cos(np.array(yaws_rad) - yaw_of(view.truth[:, :3])) > np.cos(HIDES_RAD)))
+
+
+def true_ends(items: Iterable[SceneItem]) -> list[FloatArray]:
+    """Both ends (2, 3) of the line of the true yaw, if there is one among the items."""
+    return [item.points[0] for item in items if isinstance(item, Segments) and item.name == TRUTH]
 
 
 def spoke(
@@ -99,8 +114,8 @@ def spoke(
 
 
 def name(path: str, view: RunView, yaw_rad: float, words: str) -> Label:
-    """A label outside the ring at a yaw."""
-    radius_m = view.sphere_m * END
+    """A label outside the ring at a yaw, beyond the lines that end there."""
+    radius_m = view.sphere_m * (BEYOND if _hides_truth(view, [yaw_rad]) else END)
     place = view.middle + radius_m * directions(np.array([yaw_rad]))[0]
     return Label(path, "yaw ring", place - np.array([0.0, 0.25 * view.sphere_m, 0.0]), words)
 

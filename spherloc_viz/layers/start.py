@@ -3,10 +3,11 @@
 import numpy as np
 
 from spherloc.cameras.base import model_name
+from spherloc.geometry import camera_centre
 from spherloc.problem import Problem
 from spherloc_viz import style
 from spherloc_viz.layers import ring
-from spherloc_viz.layers.frame import Frame, Plan, RunView, one_color, sphere_box
+from spherloc_viz.layers.frame import CAMERA_ROOM, Frame, Plan, RunView, one_color, sphere_box
 from spherloc_viz.layers.primitives import Focus, Label, SceneItem, Segments
 
 
@@ -82,6 +83,9 @@ def example(view: RunView) -> int:
 def _match(view: RunView) -> Frame:
     number, problem = example(view), view.trace.problem
     (u, v), mask = problem.pixels[number], view.mask(np.array(number))
+    subject = [sphere_box(view.middle, view.sphere_m), _ray(view, number).points[0]]
+    if view.truth is not None:
+        subject.append(sphere_box(camera_centre(view.truth), CAMERA_ROOM * view.sphere_m))
     return Frame(
         f"Match {number} says that the pixel ({u:.1f}, {v:.1f}) shows the map point {view.place(view.points[number])}, "
         "so the camera stands somewhere on the ray that ends there. "
@@ -91,7 +95,7 @@ def _match(view: RunView) -> Frame:
         view.colors(style.UNDECIDED, (mask, style.SAMPLE)),
         mask,
         items=(_ray(view, number),),
-        focus=Focus("Overview", np.vstack([sphere_box(view.middle, view.sphere_m), _ray(view, number).points[0]])),
+        focus=Focus("Overview", np.vstack(subject)),
     )
 
 

@@ -389,8 +389,8 @@ def _pair(view: RunView, balls: BallSet) -> Frame:
 
 
 def _name(centre: FloatArray, radius_m: float, words: str) -> Label:
-    """A label above a ball."""
-    return Label("balls/name", "balls", centre - np.array([0.0, 1.15 * radius_m, 0.0]), words)
+    """A label above a ball, which does not cover it where it is small on the screen."""
+    return Label("balls/name", "balls", centre - np.array([0.0, 1.6 * radius_m, 0.0]), words)
 
 
 def _some(view: RunView, balls: BallSet, size: int) -> Frame:

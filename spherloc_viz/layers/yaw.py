@@ -187,6 +187,7 @@ def _pair(view: RunView, arcs: Arcs) -> Frame:
     lo, hi = np.degrees(stage.lo_rad[k]), np.degrees(stage.hi_rad[k])
     also = ", and a second arc" if len(example) > 1 else ""
     d1, d2, d3 = pair_roots(view, first, second).wave
+    items = _items(view, arcs, np.array([k]), (first, second))
     return Frame(
         f"Matches {first} and {second} can both be right only where the line between their points turns into the plane "
         f"of their bearings, and that fixes the yaw. With {view.trace.options.bound_px:.3g} px of noise it is an arc "
@@ -195,12 +196,12 @@ def _pair(view: RunView, arcs: Arcs) -> Frame:
         *_shown(view, (first, second), 0.5 * float(stage.lo_rad[k] + stage.hi_rad[k])),
         note=stage.rule,
         items=(
-            *_items(view, arcs, np.array([k]), (first, second)),
+            *items,
             ring.name(
                 "ring/name", view, 0.5 * float(stage.lo_rad[k] + stage.hi_rad[k]), "arc: the yaws this pair allows"
             ),
         ),
-        focus=ring_focus(view, view.points[[first, second]]),
+        focus=ring_focus(view, view.points[[first, second]], *ring.true_ends(items)),
     )
 
 
@@ -212,14 +213,15 @@ def _roots(view: RunView, arcs: Arcs) -> Frame:
     one, several = arcs.pair_counts
     none = stage.pairs_total - one - several
     other = example[np.argmin(arcs.in_clique[example])]
+    items = _items(view, arcs, example, (first, second))
     return Frame(
         f"{_why(found, len(example))} Of all {stage.pairs_total:,} pairs, {several:,} have two arcs or more, {one:,} "
         f"have one, and {none:,} have none.",
         "θ = atan2(d2, d1) ± arccos(−d3 / √(d1² + d2²))   (Eq. 22-23)",
         *_shown(view, (first, second), 0.5 * float(stage.lo_rad[other] + stage.hi_rad[other])),
         note=stage.rule,
-        items=_items(view, arcs, example, (first, second)),
-        focus=ring_focus(view, view.points[[first, second]]),
+        items=items,
+        focus=ring_focus(view, view.points[[first, second]], *ring.true_ends(items)),
     )
 
 
