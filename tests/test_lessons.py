@@ -8,7 +8,7 @@ from spherloc.errors import InputError
 from spherloc_viz import style
 from spherloc_viz.app.lesson_file import LinkedRuns, images_of, images_picture
 from spherloc_viz.layers import steps
-from spherloc_viz.lessons import lessons
+from spherloc_viz.lessons import lesson_named, lessons
 from spherloc_viz.lessons.html import FORMULA, IMAGES, changes_in, lesson_page, list_page, names_in
 from spherloc_viz.lessons.lesson import MANY, changed_state, parse_lesson, state_parts
 from spherloc_viz.lessons.numbers import numbers_of
@@ -137,6 +137,9 @@ def test_pages_of_all_lessons_are_made():
         page = lesson_page(lesson, LESSONS)
         assert page.count("<section") == len(lesson.moments)
         assert "$" not in re.sub(r"<script>.*?</script>|<style>.*?</style>", "", page, flags=re.DOTALL)
+        following = re.search(r'<p class="onward"><a href="/learn/([^"]*)">', page)
+        assert following is None or not lesson_named(following[1]).lecture
+    assert '<span class="whole">--estimator</span> ' in lesson_page(lesson_named("your-camera"), LESSONS)
     assert len(set(LESSONS)) == len(LESSONS), "their pictures are kept by lesson"
     listed = list_page(LESSONS, "/p/")
     assert all(f"/learn/{lesson.name}" in listed for lesson in LESSONS)

@@ -19,6 +19,9 @@ from spherloc_viz.lessons.lesson import Lesson, Moment, Question, changed_state,
 FORMULA = re.compile(r"\$\$(.+?)\$\$|\$(.+?)\$", re.DOTALL)
 FIELD = re.compile(r"\{([^{}]+)\}")
 LINK = re.compile(r'<a href="#([^"]*)">')
+CODE = re.compile(r"(?<!<pre>)<code>([^<]*)</code>")
+HYPHENED = re.compile(r"[^ ]*-[^ ]*")
+"""A word that a browser would break after its hyphens: a command that begins its options with them is read wrongly."""
 MARK, END = "\ue000", "\ue001"
 """Around the number of a formula while Markdown is read, which would take its signs for its own."""
 PERCENT = "%"
@@ -85,6 +88,7 @@ def prose_html(text: str, state: str, form: Form = LIVE) -> str:
         return f"{MARK}{len(formulas) - 1}{END}"
 
     html = _markdown().render(FORMULA.sub(keep, text))
+    html = CODE.sub(lambda found: f"<code>{HYPHENED.sub(_whole, found[1])}</code>", html)
     html = LINK.sub(lambda found: _link(unescape(found[1]), state, form), html)
     html = FIELD.sub(lambda found: _field(unescape(found[1]), state, form), html)
     return re.sub(f"{MARK}(\\d+){END}", lambda found: formulas[int(found[1])], html)
@@ -131,6 +135,10 @@ def changes_in(text: str) -> tuple[str, ...]:
 
 def _change(key: str, value: str) -> str:
     return changed_state("", f"{key.replace('.', '=', 1)}%3D{value}" if "." in key else f"{key}={value}")
+
+
+def _whole(word: re.Match[str]) -> str:
+    return f'<span class="whole">{word[0]}</span>'
 
 
 def _link(changes: str, state: str, form: Form) -> str:
@@ -223,10 +231,10 @@ def moment_html(moment: Moment, place: int, form: Form = LIVE) -> str:
 
 
 def lesson_page(lesson: Lesson, others: Collection[Lesson]) -> str:
-    """The live page of a lesson; ``others`` are those of the course, by their order."""
+    """The live page of a lesson; ``others`` are all lessons, by their order. No lesson leads on to a lecture."""
     course = list(others)
     place = [one.name for one in course].index(lesson.name)
-    following = course[place + 1] if place + 1 < len(course) else None
+    following = next((one for one in course[place + 1 :] if not one.lecture), None)
     onward = (
         f'<a href="/learn/{following.name}">Next lesson: {escape(following.title)}</a>'
         if following
