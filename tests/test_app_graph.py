@@ -17,7 +17,7 @@ from spherloc_viz import style
 from spherloc_viz.app.plots.graph_view import MAX_EDGES, cell_nodes, edges_of, graph_html, graph_note, matrix_png
 from spherloc_viz.layers import graph_begins, paint, steps
 from spherloc_viz.layers.primitives import Graph
-from spherloc_viz.layers.translation import MAX_NODES, ball_nodes
+from spherloc_viz.layers.translation import MAX_NODES, BallSet, ball_nodes, graph_at
 
 
 @pytest.fixture(scope="module")
@@ -117,11 +117,19 @@ def test_more_nodes_are_thinned_evenly(mc: Trace) -> None:
     edges = np.argwhere(np.triu(apart, 1)).astype(np.int32)
     pairs = np.column_stack([np.arange(count), np.arange(count) + 1]).astype(np.int32)
     large = TranslationStage(**{**vars(stage), "pairs": pairs, "centres_m": centres, "radii_m": radii, "edges": edges})
-    nodes = ball_nodes(large)
+    balls = BallSet(large)
+    nodes = ball_nodes(balls)
     assert len(nodes.number) == MAX_NODES == len(set(nodes.number.tolist())) and nodes.total == count
     np.testing.assert_array_equal(
         nodes.agrees, apart[np.ix_(nodes.number, nodes.number)] & ~np.eye(MAX_NODES, dtype=bool)
     )
+    # A step of few balls has them all, so that its graph has the overlaps that its caption counts.
+    for size in (10, 30, 300):
+        first = balls.order[:size]
+        graph = graph_at(lambda: nodes, first, np.zeros(0, dtype=np.int64), style.CLIQUE, "")
+        edges, whole = edges_of(graph), len(balls.edges_within(balls.mask(first)))
+        assert (graph.shown.sum() == size and edges.total == whole) == (size <= 30)
+        assert (f"{graph.shown.sum()} of 300 balls are drawn" in graph_note(graph, edges)) == (size == 300)
 
 
 def test_the_note_is_true_of_one_node_and_of_few(mc: Trace) -> None:

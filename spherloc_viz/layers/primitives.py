@@ -206,6 +206,8 @@ class Graph:
     nodes: Nodes
     shown: NDArray[np.bool_]
     """(K,) mask of the nodes that the steps so far have added."""
+    count: int
+    """Number of nodes that the steps so far have added, drawn or not."""
     marked: NDArray[np.bool_]
     """(K,) mask of the nodes that the step is about."""
     color: tuple[int, int, int]

@@ -187,14 +187,17 @@ class BallSet:
 
 MAX_NODES = 400
 """Largest number of nodes; of more, the clique, or an even sample of it, and an even sample of the others are drawn."""
+WHOLE = 30
+"""Number of balls, of all and of the clique, with which a step's graph still has every ball of the step."""
 INNER, OUTER = 0.08, 0.97
 """Smallest and largest radius of a node's position; the whole drawing has radius 1."""
 
 
-def ball_nodes(stage: TranslationStage) -> Nodes:
+def ball_nodes(balls: BallSet) -> Nodes:
     """Nodes are balls, and overlapping ones agree."""
-    total = len(stage.radii_m)
-    chosen = _chosen(total, stage.clique.astype(np.int64), np.argsort(stage.radii_m, kind="stable"))
+    stage, total = balls.stage, len(balls)
+    first = np.union1d(balls.order[:WHOLE], balls.members[:WHOLE])
+    chosen = _chosen(total, stage.clique.astype(np.int64), balls.by_radius, first)
     place = np.full(total, -1)
     place[chosen] = np.arange(len(chosen))
     ends = place[stage.edges]
@@ -214,22 +217,22 @@ def match_nodes(view: RunView, stage: ConsensusStage) -> Nodes:
     """Nodes are matches, and those agree that have an arc over the stage's yaw."""
     aligned = view.trace.problem.aligned
     places = np.searchsorted(aligned.index, stage.clique)
-    chosen = _chosen(len(aligned.index), places, np.arange(len(aligned.index)))
+    chosen = _chosen(len(aligned.index), places, np.arange(len(aligned.index)), np.zeros(0, dtype=np.int64))
     agrees = agreement(aligned, view.bounds.radians, stage.yaw_rad, chosen, chosen)
     seen = aligned.bearings[chosen] @ yaw_rotation(stage.yaw_rad)
     matches = aligned.index[chosen].astype(np.int64)[:, None]
     return _nodes("match", chosen, len(aligned.index), seen, matches, agrees | agrees.T, places)
 
 
-def _chosen(total: int, clique: IntArray, order: IntArray) -> IntArray:
-    """Nodes to draw, at most ``MAX_NODES``."""
+def _chosen(total: int, clique: IntArray, order: IntArray, first: IntArray) -> IntArray:
+    """Nodes to draw, at most ``MAX_NODES``, among them ``first``."""
     if total <= MAX_NODES:
         return order
-    inside = np.zeros(total, dtype=bool)
-    inside[clique] = True
-    members, others = order[inside[order]], order[~inside[order]]
-    take = min(len(members), max(MAX_NODES // 2, MAX_NODES - len(others)))
-    return np.concatenate([even(members, take), even(others, MAX_NODES - take)])
+    rest, room = order[~np.isin(order, first)], MAX_NODES - len(first)
+    inside = np.isin(rest, clique)
+    members, others = rest[inside], rest[~inside]
+    take = min(len(members), max(room // 2, room - len(others)))
+    return np.concatenate([first, even(members, take), even(others, room - take)])
 
 
 def _nodes(
@@ -272,7 +275,8 @@ def graph_at(
     """The graph of a step: the shown nodes, by their indices in the stage (None for all), and the marked ones."""
     known = nodes()
     there = np.ones(len(known.number), dtype=bool) if shown is None else np.isin(known.number, shown)
-    return Graph(known, there, there & np.isin(known.number, marked), color, words)
+    count = known.total if shown is None else len(shown)
+    return Graph(known, there, count, there & np.isin(known.number, marked), color, words)
 
 
 SIZES = (3, 10, 30, 100, 300)
@@ -286,7 +290,7 @@ NAME_ROOM = 2.5
 def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
     """Steps for one ball, more and more balls, two greedy cliques, and the maximum clique."""
     balls, no_balls = BallSet(stage), np.zeros(0, dtype=np.int64)
-    nodes = cache(partial(ball_nodes, stage))
+    nodes = cache(partial(ball_nodes, balls))
 
     def graph(shown: IntArray | None, marked: IntArray, words: str, color: style.RGB = style.CLIQUE) -> Graph:
         return graph_at(nodes, shown, marked, color, words)

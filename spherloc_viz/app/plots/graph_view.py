@@ -74,12 +74,14 @@ def graph_note(graph: Graph, edges: Edges) -> str:
     if shown == 1:
         return f"One {nodes.name}: no edge yet, and a matrix of one cell. {press}"
     said = []
-    if shown == len(nodes.number) < nodes.total:
-        said.append(f"{shown:,} of {nodes.total:,} {_many(nodes.name)} are drawn, evenly from clique and rest.")
+    if shown < graph.count:
+        said.append(f"{shown:,} of {graph.count:,} {_many(nodes.name)} are drawn, evenly from clique and rest.")
     if drawn < edges.total:
         said.append(f"{drawn:,} of the {edges.total:,} edges between them are drawn, evenly.")
     elif edges.total:
-        said.append(f"All {edges.total:,} edges are drawn." if edges.total > 1 else "The only edge is drawn.")
+        between = " between them" if shown < graph.count else ""
+        many = edges.total > 1
+        said.append(f"All {edges.total:,} edges{between} are drawn." if many else f"The only edge{between} is drawn.")
     else:
         said.append("No two of them agree yet, so there is no edge.")
     said.append(f"The matrix has a row and a column for each of the {shown:,} nodes.")
