@@ -16,7 +16,7 @@ from spherloc.trace import Trace
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.views import Walls
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Label, Mesh, Segments
+from spherloc_viz.layers.primitives import Focus, Label, Mesh, Segments
 
 
 @pytest.fixture(scope="module")
@@ -104,3 +104,29 @@ def test_a_step_is_seen_from_a_side_where_no_wall_hides_it(trace: Trace) -> None
     walls = Walls(mesh, np.eye(3))
     assert walls.blocked(free.position, subject) > 0.5
     assert walls.blocked(views.follow(picture, 1.5, walls).position, subject) < 0.2
+
+
+def test_a_post_before_the_middle_of_the_subject_is_seen_around(trace: Trace) -> None:
+    picture = next(one for one in (paint(trace, k) for k in range(1, 9)) if one.focus.view == "Sphere")
+    subject, free = picture.focus.points, views.follow(picture, 1.5)
+    middle = subject.mean(axis=0)
+    toward = free.position - middle
+    post, half_m = middle + 0.3 * toward, 0.03 * float(np.linalg.norm(toward))
+    ground = box(tuple(middle + [-9, 5, -9]), tuple(middle + [9, 5.1, 9]))
+    walls = Walls(glb(box(tuple(post - half_m), tuple(post + half_m)), ground), np.eye(3))
+    assert not walls.blocked(free.position, subject) and walls.blocked(free.position, middle[None])
+    assert not walls.blocked(views.follow(picture, 1.5, walls).position, middle[None])
+
+
+def test_the_sphere_does_not_stand_before_a_ball(trace: Trace) -> None:
+    """Wherever the ball of a step is, behind the sphere as seen from the first direction too."""
+    picture = paint(trace, 1)
+    surface = next(item for item in picture.scene if isinstance(item, Mesh) and item.name == "sphere/surface")
+    centre, radius_m = surface.vertices.mean(axis=0), float(np.ptp(surface.vertices[:, 0])) / 2
+    for turn in np.radians(np.arange(0.0, 360.0, 45.0)):
+        ball = centre + 1.8 * radius_m * np.array([np.cos(turn), 0.1, np.sin(turn)])
+        moved = replace(picture, focus=Focus("Balls", ball + 0.7 * radius_m * np.vstack([np.eye(3), -np.eye(3)])))
+        position = views.follow(moved, 1.5).position
+        along = np.linspace(0.0, 1.0, 200)[:, None]
+        apart_m = np.linalg.norm(position + along * (ball - position) - centre, axis=1)
+        assert apart_m.min() > radius_m, np.degrees(turn)

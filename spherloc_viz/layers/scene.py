@@ -22,7 +22,9 @@ from spherloc_viz.layers.uncertainty import error_items
 BAR_SHARE = 0.25
 """Largest length of the scale bar, as a share of the map's width."""
 BAR_TICK = 0.04
-"""Height of its marks, as a share of the bar."""
+"""Height of its marks, and of the bar above the ground, as a share of the bar: a kerb must not hide it."""
+BAR_INSET = 0.12
+"""Its distance from the near side of the map, as a share of the map's depth: at the side itself may stand a wall."""
 CELL_SHARE, GROUND_SHARE = 0.2, 0.9
 """Largest side of a cell of the ground, and the ground's radius, as shares of the map's width."""
 RIM = 72
@@ -33,7 +35,8 @@ def scale_bar(view: RunView) -> list[SceneItem]:
     """The bar with its length, in front of the map as the overview shows it."""
     low, high = view.dense_box
     length = round_length(BAR_SHARE * max(float((high - low)[[0, 2]].max()), 1e-3))
-    start = np.array([0.5 * (low + high)[0] - 0.5 * length, high[1], low[2] - BAR_TICK * length])
+    near = low[2] + BAR_INSET * (high - low)[2]
+    start = np.array([0.5 * (low + high)[0] - 0.5 * length, high[1] - BAR_TICK * length, near])
     along, tick = np.array([length, 0.0, 0.0]), np.array([0.0, -BAR_TICK * length, 0.0])
     marks = start + np.array([0.0, 0.5, 1.0])[:, None] * along
     heights = np.array([1.0, 0.6, 1.0])[:, None] * tick

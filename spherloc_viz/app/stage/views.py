@@ -20,7 +20,7 @@ SAMPLES = 400_000
 STEPS = 64
 """Number of samples along each line of sight."""
 TARGETS = 24
-"""Largest number of lines of sight."""
+"""Number of points of a subject to which there should be a line of sight."""
 NEAR_SHARE, FAR = 0.08, 0.97
 """Part of each line of sight that is tested, as shares from the viewer: the mesh may touch what is to be seen."""
 MAX_BYTES = 60 << 20
@@ -37,7 +37,6 @@ class Walls:
 
     def blocked(self, position: FloatArray, targets: FloatArray) -> float:
         """Share of the targets (K, 3) that cannot be seen from a position (3,)."""
-        targets = targets[:: max(1, len(targets) // TARGETS)]
         along = np.linspace(NEAR_SHARE, FAR, STEPS)[:, None, None]
         places = (position + along * (targets - position)) @ self._turn  # back into the map frame
         cells = np.floor((places - self._low) / self._cell_m).astype(np.int64)
@@ -287,10 +286,28 @@ def _clear(
     directions = np.array([yaw_rotation(turn) @ np.array(side) for side in sides for turn in TURNS_RAD])
     points = next(item for item in picture.scene if isinstance(item, Points) and item.name == "map/points")
     hidden = _in_the_way(*_fits(clear, directions, aspect), points.positions) + 0.5 * np.arange(len(directions))
+    positions, looked_at = _fits(subject, directions, aspect)[0], _sample(subject)
     if walls is not None:
-        blocked = [walls.blocked(position, subject) for position in _fits(subject, directions, aspect)[0]]
-        hidden += len(points.positions) * np.array(blocked)
+        hidden += len(points.positions) * np.array([walls.blocked(position, looked_at) for position in positions])
+    surface = _surface(picture)
+    if name == "Balls" and surface is not None:
+        hidden += len(points.positions) * np.mean(_behind(surface, positions, looked_at), axis=1)
     return _fit(subject, directions[int(np.argmin(hidden))], aspect)
+
+
+def _sample(subject: FloatArray) -> FloatArray:
+    """About ``TARGETS`` points: some of a subject (K, 3), which may be its outermost ones alone, as many halfway to its
+    middle, and the middle."""
+    outer, middle = subject[:: max(1, -(-2 * len(subject) // TARGETS))], np.mean(subject, axis=0)
+    return np.vstack([outer, (outer + middle) / 2, middle])
+
+
+def _behind(surface: Mesh, positions: FloatArray, targets: FloatArray) -> NDArray[np.bool_]:
+    """Whether the sphere hides targets (K, 3) from positions (D, 3), as (D, K)."""
+    sight = targets - positions[:, None]
+    to_centre = (_centre(surface) - positions)[:, None]
+    share = np.clip(np.sum(to_centre * sight, axis=2) / np.sum(sight**2, axis=2), 0.0, 1.0)
+    return np.linalg.norm(share[..., None] * sight - to_centre, axis=2) < _radius_m(surface)
 
 
 def _inside(picture: Picture) -> View:

@@ -1,6 +1,6 @@
 // Shows the introduction that Python put on the page (data-introduction) on the first visit: a card over the canvas with
-// a few moments, each of which takes the page to a step. Only the reader turns it: Next, Back and Skip, the arrow keys and
-// Escape. It is not shown again: the browser remembers it. Nor is it shown to whoever comes by a link. An element of the
+// a few moments, each of which takes the page to a step. Only the reader turns it: Next, Back and Skip, the arrow keys, B, N
+// and Escape. It is not shown again: the browser remembers it. Nor is it shown to whoever comes by a link. An element of the
 // class "introduce" shows it again.
 (() => {
   const SEEN = "spherloc-introduction", EVERY_MS = 250;
@@ -108,12 +108,12 @@
   }, EVERY_MS);
 
   addEventListener("keydown", (event) => {
-    if (!card || !event.isTrusted) return;
-    const by = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    if (!card || !event.isTrusted || event.ctrlKey || event.metaKey || event.altKey) return;
+    const by = { ArrowLeft: -1, b: -1, ArrowRight: 1, n: 1 }[event.key];
     const taken = event.target instanceof Element && event.target.closest("input, textarea, [role=slider], [role=tab]");
     if (event.key === "Escape") end();
     else if (by && !taken) {
-      event.stopPropagation(); // the canvas turns by the arrow keys
+      event.stopPropagation(); // the canvas turns by the arrow keys, the step changes by B and N
       turn(by);
     }
   }, true);
