@@ -9,7 +9,7 @@ from spherloc_viz import style
 from spherloc_viz.app.lesson_file import LinkedRuns, images_of, images_picture
 from spherloc_viz.layers import steps
 from spherloc_viz.lessons import lesson_named, lessons
-from spherloc_viz.lessons.html import FORMULA, IMAGES, changes_in, lesson_page, list_page, names_in
+from spherloc_viz.lessons.html import FORMULA, IMAGES, changes_in, lesson_page, list_page, names_in, prose_html
 from spherloc_viz.lessons.lesson import MANY, changed_state, parse_lesson, state_parts
 from spherloc_viz.lessons.numbers import numbers_of
 from tests.lesson_claims import holds, split_claim
@@ -140,6 +140,7 @@ def test_pages_of_all_lessons_are_made():
         following = re.search(r'<p class="onward"><a href="/learn/([^"]*)">', page)
         assert following is None or not lesson_named(following[1]).lecture
     assert '<span class="whole">--estimator</span> ' in lesson_page(lesson_named("your-camera"), LESSONS)
+    assert prose_html("Half of 4 m, {off_cm} cm {slider seed 1 2 1 %}", "seed=1").count("\N{NO-BREAK SPACE}") == 2
     assert len(set(LESSONS)) == len(LESSONS), "their pictures are kept by lesson"
     listed = list_page(LESSONS, "/p/")
     assert all(f"/learn/{lesson.name}" in listed for lesson in LESSONS)

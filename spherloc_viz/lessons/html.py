@@ -22,6 +22,8 @@ LINK = re.compile(r'<a href="#([^"]*)">')
 CODE = re.compile(r"(?<!<pre>)<code>([^<]*)</code>")
 HYPHENED = re.compile(r"[^ ]*-[^ ]*")
 """A word that a browser would break after its hyphens: a command that begins its options with them is read wrongly."""
+UNIT = re.compile(r"(?<=[\d}]) (?=(?:px|cm|m|km|%)(?![a-z]))(?![^{]*\})")
+"""The space between a number, or the field of one, and its unit, where no line should end."""
 MARK, END = "\ue000", "\ue001"
 """Around the number of a formula while Markdown is read, which would take its signs for its own."""
 PERCENT = "%"
@@ -90,7 +92,7 @@ def prose_html(text: str, state: str, form: Form = LIVE) -> str:
     html = _markdown().render(FORMULA.sub(keep, text))
     html = CODE.sub(lambda found: f"<code>{HYPHENED.sub(_whole, found[1])}</code>", html)
     html = LINK.sub(lambda found: _link(unescape(found[1]), state, form), html)
-    html = FIELD.sub(lambda found: _field(unescape(found[1]), state, form), html)
+    html = FIELD.sub(lambda found: _field(unescape(found[1]), state, form), UNIT.sub("\N{NO-BREAK SPACE}", html))
     return re.sub(f"{MARK}(\\d+){END}", lambda found: formulas[int(found[1])], html)
 
 
