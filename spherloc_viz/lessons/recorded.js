@@ -1,5 +1,6 @@
 // The scenes of an exported lesson: viser's page in a frame with one recorded scene inside, and the numbers of its run.
-// States are "at=PLACE". The old scene stays until the new one is drawn. ``told`` is called with the numbers then.
+// States are "at=PLACE". The old scene stays until the new one is drawn, but it stands still: without a graphics card
+// its own frames would keep the new one waiting. ``told`` is called with the numbers of the new one when it is drawn.
 function openScene(told) {
   const SETTLE_MS = 200, EVERY_MS = 60, PATIENCE_MS = 20000;
   const viewer = JSON.parse(document.getElementById("viewer").textContent);
@@ -40,6 +41,7 @@ function openScene(told) {
       }
       place = next;
       turn += 1;
+      for (const { contentWindow } of box.children) contentWindow.requestAnimationFrame = () => 0;
       clearTimeout(timer);
       timer = setTimeout(load, SETTLE_MS);
     },
