@@ -20,6 +20,11 @@ IMAGES = {".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 """Endings of the names of files that count as images, in lower case."""
 
 
+def is_image(name: str) -> bool:
+    """Whether a file counts as an image by its name; hidden files, such as macOS's "._photo.jpg", do not."""
+    return Path(name).suffix.lower() in IMAGES and not name.startswith(".")
+
+
 def is_file(path: Path) -> bool:
     """True for a regular file, links followed; False also for a path that cannot be looked up: too long, no
     permission."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from spherloc.errors import InputError, shorten
-from spherloc.files import IMAGES, is_file, is_folder, names_in
+from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in
 
 VIDEOS = {".360", ".avi", ".insv", ".m4v", ".mkv", ".mov", ".mp4", ".webm"}
 SCENE = "give the path of a scene file (TOML) or a bundled scene's name, which spherloc scenes lists"
@@ -85,7 +85,7 @@ def _folder(path: Path) -> tuple[str, str]:
     images = _images(names)
     if images:
         return _counted(images, "image"), f"make a map of it with: spherloc map {_quoted(path)}"
-    inside = _image_folders(path, names)
+    inside = images_in_folders(path, names)
     if inside:
         most = max(inside, key=lambda name: inside[name])
         what = f"a folder without images, but with {sum(inside.values()):,} in the folders in it"
@@ -102,10 +102,10 @@ def _folder(path: Path) -> tuple[str, str]:
 
 
 def _images(names: Sequence[str]) -> int:
-    return sum(Path(name).suffix.lower() in IMAGES for name in names)
+    return sum(is_image(name) for name in names)
 
 
-def _image_folders(path: Path, names: Sequence[str]) -> dict[str, int]:
+def images_in_folders(path: Path, names: Sequence[str]) -> dict[str, int]:
     """Number of images in each subfolder that has some, by its name."""
     counts = {}
     for name in [name for name in names if is_folder(path / name)][:_MAX_FOLDERS]:

@@ -16,7 +16,7 @@ from spherloc.datasets import map_scene, scene_file
 from spherloc.datasets.colmap import gravity_of_map, model_views, some, split_gravity, unit_vector
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, shorten, show
-from spherloc.files import IMAGES, is_file, names_in, size_of
+from spherloc.files import IMAGES, is_file, is_image, names_in, size_of
 from spherloc.formats.colmap_files import read_model
 from spherloc.frontend.lifting import DepthLift
 from spherloc.frontend.partners import with_triangulation
@@ -287,7 +287,7 @@ def _names(table: dict[str, Any], path: Path) -> tuple[Path, list[str]]:
             raise InputError(f"{path}: images is {show(value)}; give a folder or a list of files.")
         return path.parent, value
     root = map_scene.folder(table, "images", path)
-    names = [name for name in names_in(root) if Path(name).suffix.lower() in IMAGES]
+    names = [name for name in names_in(root) if is_image(name)]
     if not names:
         raise InputError(f"{path}: the folder {root} has no images ({', '.join(sorted(IMAGES))}); correct 'images'.")
     return root, names

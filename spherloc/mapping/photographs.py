@@ -1,6 +1,6 @@
 """The photographs from which a map is made: a folder's images with their camera, or the sharpest frames of a video."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
@@ -11,12 +11,12 @@ import numpy as np
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import load_camera
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.datasets.given_path import what_it_is
+from spherloc.datasets.given_path import SCENE, images_in_folders, what_it_is
 from spherloc.errors import InputError, SpherlocError, shorten
-from spherloc.files import IMAGES, is_file, is_folder, names_in
+from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
-from spherloc.images import grey, read_size
+from spherloc.images import check_image, grey
 from spherloc.mapping.lens import for_colmap
 from spherloc.types import ByteArray
 
@@ -25,6 +25,10 @@ MAX_IMAGES = 500
 """Largest number of images of a map: the features of each take 4 MB."""
 MIN_PANORAMA_PX = 200
 """Least length of the longer side of a panorama."""
+UNREAD = {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gpr", ".heic", ".heif", ".insp", ".nef", ".orf", ".raf", ".rw2"}
+"""Endings of photographs that OpenCV does not read."""
+MAX_NAMED = 3
+"""Largest number of names in a remark."""
 CALIBRATIONS = (".yaml", ".yml", ".json", ".toml")
 MAX_CALIBRATIONS = 20
 """Largest number of files beside the photographs that are tried as a calibration."""
@@ -51,15 +55,19 @@ def photographs(folder: Path, camera: Camera | None, masks: Masks | None = None)
     """
     if not is_folder(folder):
         raise InputError(what_it_is(folder) or f"{folder}: is not a folder; give the folder of the photographs.")
+    there = names_in(folder)
     sizes: dict[tuple[int, int], list[str]] = {}
-    remarks = []
-    for name in (name for name in names_in(folder) if Path(name).suffix.lower() in IMAGES):
-        try:
-            sizes.setdefault(read_size(folder / name), []).append(name)
-        except InputError as error:
-            remarks.append(f"{shorten(name)} was left out: {error}")
+    damaged, others = [], [name for name in there if not is_image(name)]
+    for name in there:
+        if is_image(name):
+            try:
+                sizes.setdefault(check_image(folder / name), []).append(name)
+            except InputError:
+                damaged.append(name)
+    remarks = [*_about_damaged(damaged), *_about_unread(others)]
     if not sizes:
-        raise InputError(f"{folder}: has no photographs ({', '.join(sorted(IMAGES))}); give the folder that has them.")
+        raise InputError(_without_photographs(folder, remarks))
+    remarks += _about_subfolders(folder, others)
     size = (camera.width, camera.height) if camera else max(sizes, key=lambda key: len(sizes[key]))
     width, height = size
     if camera is None and width == 2 * height and width >= MIN_PANORAMA_PX:
@@ -73,11 +81,11 @@ def photographs(folder: Path, camera: Camera | None, masks: Masks | None = None)
             )
         remarks.append(f"The calibration is {shorten(name)}, which lies beside the photographs.")
     names = sizes.pop(size, [])
-    others = sorted(name for rest in sizes.values() for name in rest)
-    if others:
+    rest = sorted(name for same in sizes.values() for name in same)
+    if rest:
         remarks.append(
-            f"{len(others)} of {len(others) + len(names)} images were left out, as they are not {width} x {height} "
-            f"pixels; the first is {shorten(others[0])}."
+            f"{len(rest)} of {len(rest) + len(names)} images were left out, as they are not {width} x {height} "
+            f"pixels; the first is {shorten(rest[0])}."
         )
     if len(names) < MIN_IMAGES:
         raise InputError(
@@ -97,6 +105,46 @@ def photographs(folder: Path, camera: Camera | None, masks: Masks | None = None)
         views, without = masks.on(views)
         remarks += without
     return Photographs(views, tuple(remarks))
+
+
+def _about_damaged(names: Sequence[str]) -> list[str]:
+    if not names:
+        return []
+    return [f"{_were(len(names), 'image')} left out, damaged or empty: {_some(names)}; copy again what is needed."]
+
+
+def _about_unread(names: Sequence[str]) -> list[str]:
+    unread = [name for name in names if Path(name).suffix.lower() in UNREAD and not name.startswith(".")]
+    if not unread:
+        return []
+    kinds = ", ".join(sorted({Path(name).suffix.lower() for name in unread}))
+    return [f"{_were(len(unread), 'photograph')} left out: {_some(unread)}; convert {kinds} to JPEG or PNG."]
+
+
+def _about_subfolders(folder: Path, names: Sequence[str]) -> list[str]:
+    inside = images_in_folders(folder, names)
+    if not inside:
+        return []
+    count = sum(inside.values())
+    return [f"{_were(count, 'image')} left out, in subfolders: {_some(list(inside))}; a map is made of one folder."]
+
+
+def _without_photographs(folder: Path, remarks: Sequence[str]) -> str:
+    """Why a folder has nothing to map, and what to do."""
+    if remarks:
+        return f"{folder}: has no photographs that can be read. {' '.join(remarks)}"
+    known = what_it_is(folder)
+    if known and SCENE not in known:
+        return known
+    return f"{folder}: has no photographs ({', '.join(sorted(IMAGES))}); give the folder that has them."
+
+
+def _were(count: int, what: str) -> str:
+    return f"{count} {what} was" if count == 1 else f"{count} {what}s were"
+
+
+def _some(names: Sequence[str]) -> str:
+    return f"{', '.join(shorten(name) for name in names[:MAX_NAMED])}{', …' if len(names) > MAX_NAMED else ''}"
 
 
 def _calibration_in(folder: Path, size: tuple[int, int]) -> tuple[Camera | None, str]:

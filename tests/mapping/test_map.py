@@ -149,6 +149,9 @@ def test_photographs_that_are_refused_or_left_out(tmp_path, rng):
     (tmp_path / "walk.mp4").write_bytes(b"")
     with pytest.raises(InputError, match=r"is a video; .* spherloc map frames --video .*walk\.mp4$"):
         photographs(tmp_path / "walk.mp4", None)
+    with pytest.raises(InputError, match=r"is a folder of 1 video; .* spherloc map frames --video .*walk\.mp4$"):
+        photographs(tmp_path, None)
+    (tmp_path / "walk.mp4").unlink()
     with pytest.raises(InputError, match="has no photographs"):
         photographs(tmp_path, None)
     picture(tmp_path / "a.png", 400, 300, rng)
@@ -164,6 +167,35 @@ def test_photographs_that_are_refused_or_left_out(tmp_path, rng):
     found = photographs(tmp_path, None)
     assert [view.name for view in found.views] == ["b.png", "c.png"]
     assert len(found.remarks) == 2 and "d.png" in found.remarks[1] and "e.jpg" in found.remarks[0]
+
+
+def test_nothing_in_a_folder_of_a_stranger_is_left_out_in_silence(tmp_path, rng):
+    """One whose end is missing has a sound header, and would otherwise end the work at the features."""
+    for name in ("Büro am Fenster.JPG", "b.png", "cut.jpg"):
+        picture(tmp_path / name, 400, 200, rng)
+    (tmp_path / "cut.jpg").write_bytes((tmp_path / "cut.jpg").read_bytes()[:-5000])
+    (tmp_path / "inside").mkdir()
+    picture(tmp_path / "inside" / "f.png", 400, 200, rng)
+    for name in ("IMG_1.HEIC", "._b.png", "notes.txt"):
+        (tmp_path / name).write_bytes(b"Mac OS X")
+    found = photographs(tmp_path, None)
+    assert [view.name for view in found.views] == ["Büro am Fenster.JPG", "b.png"]
+    assert [remark.partition(":")[0] for remark in found.remarks] == [
+        "1 image was left out, damaged or empty",
+        "1 photograph was left out",
+        "1 image was left out, in subfolders",
+    ]
+    assert "cut.jpg" in found.remarks[0] and "convert .heic" in found.remarks[1] and "inside" in found.remarks[2]
+
+
+def test_a_folder_without_photographs_says_what_there_is(tmp_path, rng):
+    (tmp_path / "left").mkdir()
+    picture(tmp_path / "left" / "a.png", 400, 200, rng)
+    with pytest.raises(InputError, match=r"with 1 in the folders in it; make a map .*: spherloc map \S*left$"):
+        photographs(tmp_path, None)
+    (tmp_path / "a.heic").write_bytes(b"")
+    with pytest.raises(InputError, match=r"no photographs that can be read\. .*convert \.heic to JPEG"):
+        photographs(tmp_path, None)
 
 
 def test_images_that_show_nothing_together(tmp_path, rng):
