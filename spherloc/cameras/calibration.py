@@ -1,7 +1,8 @@
 """Reads camera calibrations of other tools, recognised by their content, and the project's own ``[camera]`` tables.
 
 Most tools put the centre of the top-left pixel at (0, 0), this project at (0.5, 0.5): what is read from them gets 0.5
-added to the principal point. The project's own TOML is taken as it is, and so is 360Loc, which shares the convention.
+added to the principal point. The project's own TOML is taken as it is, and so are COLMAP's and
+360Loc's files, which share the convention.
 """
 
 import re
@@ -13,6 +14,7 @@ from spherloc.cameras import ocam_files, tool_files
 from spherloc.cameras._checks import located
 from spherloc.cameras._files import KNOWN, UnrecognisedError, parse_json, parse_yaml, read_text, table_of, value_of
 from spherloc.cameras.base import Camera
+from spherloc.cameras.colmap_text import colmap_lines, colmap_text
 from spherloc.cameras.extensions import camera_class_of, read_by_extensions, tried
 from spherloc.cameras.tool_files import opencv
 from spherloc.errors import CalibrationError, InputError, reason, show
@@ -35,11 +37,11 @@ def load_camera(path: str | Path, name: str | None = None) -> Camera:
     The kind is recognised by the content: a KITTI-360 YAML (``model_type: MEI``), a Kalibr camchain (``cam0``, ...:
     pinhole or omni with radtan, equidistant or none, ds, eucm), the YAML of stella_vslam (``Camera``), 360Loc
     (``imgw``) and fisheye-calib-adapter (``parameter``), that of OpenCV's samples and of ROS
-    (``distortion_coefficients``), a Basalt JSON (``value0``), OCamCalib's ``calib_results.txt`` and a TOML with a
-    ``[camera]`` table or with its keys at the top. ``name`` picks a camera of a camchain or of a Basalt JSON ("cam1"),
-    by default its first one. Principal points that count from the centre of the top-left pixel are moved by +0.5 pixels
-    to this project's convention (that centre is (0.5, 0.5)). A file of another kind is given to the readers of
-    extensions (docs/extending.md).
+    (``distortion_coefficients``), a Basalt JSON (``value0``), COLMAP's ``cameras.txt``, OCamCalib's
+    ``calib_results.txt`` and a TOML with a ``[camera]`` table or with its keys at the top. ``name`` picks one of
+    ``camera_names``, by default the first one. Principal points that count from the centre of the top-left pixel are
+    moved by +0.5 pixels to this project's convention (that centre is (0.5, 0.5)). A file of another kind is given to
+    the readers of extensions (docs/extending.md).
 
     Raises ``CalibrationError``, naming the file and the place, for whatever cannot be read as a usable camera.
     """
@@ -48,6 +50,20 @@ def load_camera(path: str | Path, name: str | None = None) -> Camera:
             return _own_kind(Path(path), name)
         except UnrecognisedError as error:
             return read_by_extensions(Path(path), name, str(error))
+
+
+def camera_names(path: str | Path) -> tuple[str, ...]:
+    """Names of the cameras of a file that can have several: "cam0" in a camchain or a Basalt JSON, "1" in COLMAP's.
+
+    Empty for another file. Raises ``CalibrationError`` if the file cannot be read.
+    """
+    with located(str(path)):
+        text = read_text(Path(path))
+        if text.lstrip().startswith("{"):
+            return tool_files.basalt_names(parse_json(text))
+        if _looks_like_yaml(text):
+            return tuple(tool_files.chain_tables(parse_yaml(text)))
+        return tuple(colmap_lines(text))
 
 
 def camera_from_table(table: Any, where: str) -> Camera:
@@ -80,6 +96,9 @@ def _own_kind(path: Path, name: str | None) -> Camera:
     if ocam_files.is_ocam(text):
         _refuse_name(name)
         return ocam_files.ocam(text)
+    cameras = colmap_lines(text)
+    if cameras:
+        return colmap_text(cameras, name)
     if _looks_like_yaml(text):
         return _from_yaml(parse_yaml(text), name)
     return _from_toml(text, name)

@@ -78,6 +78,13 @@ def basalt(document: dict[Any, Any], name: str | None) -> Camera:
             )
 
 
+def basalt_names(document: Any) -> tuple[str, ...]:
+    """Names of the cameras of a Basalt JSON; none for another file."""
+    rig = document.get("value0") if isinstance(document, dict) else None
+    cameras = rig.get("intrinsics") if isinstance(rig, dict) else None
+    return tuple(f"cam{number}" for number in range(len(cameras))) if isinstance(cameras, list) else ()
+
+
 def stella(document: dict[Any, Any]) -> Camera:
     """The ``Camera`` section of stella_vslam, or OpenVSLAM's keys ``Camera.model``, ``Camera.fx``, ...
 

@@ -218,7 +218,8 @@ def overlaid(points: FloatArray, positions: FloatArray) -> Overlay:
     """
     count, size = points.shape
     if count < MIN_POSITIONS:
-        raise InputError(f"only {count} images of the map have a position, but {MIN_POSITIONS} are needed.")
+        have = f"only {count} images of the map have" if count else "no image of the map has"
+        raise InputError(f"{have} a position, but {MIN_POSITIONS} are needed.")
     best: tuple[float, FloatArray] | None = None
     for sample in _samples(count, size):
         fit = _similarity(points[sample], positions[sample])

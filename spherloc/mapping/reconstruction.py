@@ -149,8 +149,9 @@ def reconstruct(
         if same_place.max(initial=0) >= MIN_MATCHES:
             raise InputError(
                 f"{np.count_nonzero(np.triu(same_place))} pairs of the {len(views)} photographs match as if all were "
-                "taken from one place: if they were not, something moves along and is seen in each, such as a car or a "
-                "tripod, so leave it out with --mask or --nadir."
+                "taken from one place. If they were, add photographs from half a metre to two metres away; if not, "
+                "something moves along and is seen in each, such as a car or a tripod: leave it out with --mask or "
+                "--nadir."
             )
         raise InputError(
             f"no two of the {len(views)} photographs show the same place from two positions: the best pair has "

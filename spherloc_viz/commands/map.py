@@ -10,8 +10,9 @@ import html
 import io
 import json
 import os
+import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from spherloc.cameras.calibration import load_camera
+from spherloc.cameras.base import Camera
+from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError, SpherlocError, show
 from spherloc.frontend import trained
@@ -48,7 +50,7 @@ which are better placed (``python -m benchmarks.features``)."""
 def make(
     folder: Path,
     output: Path | None,
-    camera: Path | None,
+    lens: Camera | None,
     video: tuple[Path, int] | None,
     measured: Measured,
     new_images: Path | None,
@@ -59,12 +61,12 @@ def make(
 ) -> int:
     """Make the map, and print the result and what to do next; returns 1 if not all images are in it.
 
-    ``video`` is a file and a number of frames to take from it into ``folder``, ``positions`` a file of where the images
-    were taken, and ``features`` one of ``MAP_FEATURES``. Raises ``InputError``.
+    ``lens`` is the camera, if it is known, ``video`` a file and a number of frames to take from it into ``folder``,
+    ``positions`` a file of where the images were taken, and ``features`` one of ``MAP_FEATURES``. Raises
+    ``InputError``.
     """
     how = how_of(features)
     target = output or Path(f"{folder.resolve().name}_map")
-    lens = None if camera is None else load_camera(camera)
     with _stages() as tell:
         if video is not None:
             _take_frames(*video, folder, tell)
@@ -85,6 +87,22 @@ def make(
     print(f"see it        spherloc play {made.written.scene}")
     print(f"localize      spherloc localize {made.written.new_scene or made.written.scene}")
     return 0 if len(made.written.poses) == len(found.views) else 1
+
+
+def lens_of(file: Path | None, name: str | None) -> Camera | None:
+    """The camera of a calibration file, and a remark if it has several and none is named; None without a file."""
+    if file is None:
+        if name is not None:
+            raise InputError(f"--camera-name {shlex.quote(name)} goes with --camera FILE; give that file too.")
+        return None
+    names = camera_names(file)
+    if name is None and len(names) > 1:
+        say(f"{file} has {len(names)} cameras, of which {names[0]} is taken; --camera-name gives {_or(names[1:])}.")
+    return load_camera(file, name)
+
+
+def _or(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"one of {', '.join(names)}"
 
 
 def how_of(features: str) -> FrontendOptions:

@@ -294,6 +294,7 @@ def map(
     /,
     *,
     camera: OptionalPath = None,
+    camera_name: OptionalText = None,
     video: OptionalPath = None,
     frames: int = 40,
     output: OptionalPath = None,
@@ -323,6 +324,7 @@ def map(
     Args:
         folder: Folder of the photographs; with --video, where its frames are put.
         camera: Calibration file of the camera; without it, images of 2 to 1 are taken for full panoramas.
+        camera_name: Which camera of that file, if it has several: its first one if not given.
         video: Take frames from this video first, the sharpest of each stretch.
         frames: How many frames to take.
         output: Folder of the map; FOLDER_map here if not given.
@@ -338,7 +340,7 @@ def map(
     """
     from spherloc.frontend.masks import Masks
     from spherloc.mapping.make import Measured
-    from spherloc_viz.commands.map import make
+    from spherloc_viz.commands.map import lens_of, make
 
     if sum(one is not None for one in (camera_height, distance, positions)) > 1:
         raise InputError("--camera-height, --distance and --positions all give the scale; keep one.")
@@ -351,7 +353,8 @@ def map(
     masked = any(one is not None for one in (mask, nadir, seam))
     masks = Masks(mask, nadir or 0.0, seam or 0.0) if masked else None
     measured = Measured(camera_height, distance)
-    return make(folder, output, camera, taken, measured, localize, masks=masks, positions=positions, features=features)
+    lens = lens_of(camera, camera_name)
+    return make(folder, output, lens, taken, measured, localize, masks=masks, positions=positions, features=features)
 
 
 def sweep(

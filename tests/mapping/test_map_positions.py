@@ -67,7 +67,7 @@ def test_a_map_takes_it_and_says_how_good_it_is(rng):
     noise = {name: 60.0 * row for name, row in zip(NAMES, rng.normal(size=(8, 3)), strict=True)}
     with pytest.raises(InputError, match=r"GPS gives no scale: .* uncertain by .*; give --distance"):
         scale_by_positions(poses, Positions(noise, "GPS"), level)
-    with pytest.raises(InputError, match="GPS gives no scale: only 0 images"):
+    with pytest.raises(InputError, match="GPS gives no scale: no image of the map has a position, but 4 are needed"):
         scale_by_positions(poses, Positions({}, "GPS"), level)
 
 

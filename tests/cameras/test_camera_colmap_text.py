@@ -1,0 +1,48 @@
+"""COLMAP's cameras.txt as a calibration file."""
+
+import pytest
+
+from spherloc.cameras.calibration import camera_names, load_camera
+from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.errors import CalibrationError
+from spherloc_viz.commands.map import lens_of
+
+TWO = """# Camera list with one line of data per camera:
+#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
+1 OPENCV_FISHEYE 848 800 284.5 285.5 424.4 393.7 0.001 0.031 -0.03 0.005
+3 EQUIRECTANGULAR 1920 960 1920 960"""
+FIRST = KannalaBrandt(848, 800, 284.5, 285.5, 424.4, 393.7, (0.001, 0.031, -0.03, 0.005))
+
+
+def test_cameras_by_their_ids(tmp_path):
+    path = tmp_path / "cameras.txt"
+    path.write_text(TWO)
+    assert camera_names(path) == ("1", "3")
+    assert load_camera(path) == load_camera(path, "1") == FIRST
+    assert load_camera(path, "3").model == "equirectangular"
+    with pytest.raises(CalibrationError, match=r"cameras\.txt: has no camera '2': choose one of 1, 3\.$"):
+        load_camera(path, "2")
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("1 FOV 848 800 284.5 285.5 424.4 393.7 0.9", "the COLMAP model 'FOV' is not supported"),
+        ("1 PINHOLE 848 800 284.5 285.5 424.4", "give a list of 4 finite numbers"),
+        ("1 PINHOLE 848 800 284.5 285.5 424.4 wide", "'284.5 285.5 424.4 wide' are not numbers"),
+    ],
+)
+def test_a_line_that_cannot_be_used_is_named(tmp_path, line, said):
+    path = tmp_path / "cameras.txt"
+    path.write_text(line)
+    with pytest.raises(CalibrationError, match=f"camera 1: .*{said}|camera 1.*{said}"):
+        load_camera(path)
+
+
+def test_a_map_tells_which_of_several_cameras_it_takes(tmp_path, capsys):
+    path = tmp_path / "cameras.txt"
+    path.write_text(TWO)
+    assert lens_of(path, None) == FIRST
+    assert "has 2 cameras, of which 1 is taken; --camera-name gives 3." in capsys.readouterr().err
+    assert lens_of(path, "1") == FIRST
+    assert capsys.readouterr().err == ""
