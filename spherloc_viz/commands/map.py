@@ -11,6 +11,7 @@ import io
 import json
 import os
 import shlex
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -38,6 +39,7 @@ from spherloc.mapping.pairs import MIN_MATCHES
 from spherloc.mapping.photographs import Photographs, frames_of, photographs
 from spherloc.mapping.positions import read_positions
 from spherloc.mapping.upright import Tell
+from spherloc.registry import require
 from spherloc.types import FloatArray
 from spherloc_viz.commands.progress import progress, say
 
@@ -65,6 +67,7 @@ def make(
     ``positions`` a file of where the images were taken, and ``features`` one of ``MAP_FEATURES``. Raises
     ``InputError``.
     """
+    end_without_a_trace()
     how = how_of(features)
     target = output or Path(f"{folder.resolve().name}_map")
     with _stages() as tell:
@@ -87,6 +90,12 @@ def make(
     print(f"see it        spherloc play {made.written.scene}")
     print(f"localize      spherloc localize {made.written.new_scene or made.written.scene}")
     return 0 if len(made.written.poses) == len(found.views) else 1
+
+
+def end_without_a_trace() -> None:
+    """Let a termination signal simply end the process: once imported, pycolmap prints a stack trace at one."""
+    require("pycolmap", "colmap", "making a map")
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def lens_of(file: Path | None, name: str | None) -> Camera | None:

@@ -1,6 +1,8 @@
 """Maps of photographs: rendered panoramas with known poses, on the way that the command takes, and what is refused."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import cv2
@@ -196,6 +198,13 @@ def test_a_folder_without_photographs_says_what_there_is(tmp_path, rng):
     (tmp_path / "a.heic").write_bytes(b"")
     with pytest.raises(InputError, match=r"no photographs that can be read\. .*convert \.heic to JPEG"):
         photographs(tmp_path, None)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no termination signal")
+def test_a_terminated_map_prints_no_stack_trace():
+    code = "import os, signal; from spherloc_viz.commands.map import end_without_a_trace; end_without_a_trace(); "
+    done = subprocess.run([sys.executable, "-c", f"{code}os.kill(os.getpid(), signal.SIGTERM)"], capture_output=True)
+    assert done.returncode == -15 and done.stderr == b""
 
 
 def test_images_that_show_nothing_together(tmp_path, rng):
