@@ -29,7 +29,7 @@ UNREAD = {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gpr", ".heic", ".heif", ".i
 """Endings of photographs that OpenCV does not read."""
 MAX_NAMED = 3
 """Largest number of names in a remark."""
-CALIBRATIONS = (".yaml", ".yml", ".json", ".toml")
+CALIBRATIONS = (".yaml", ".yml", ".json", ".toml", ".txt")
 MAX_CALIBRATIONS = 20
 """Largest number of files beside the photographs that are tried as a calibration."""
 SHARPNESS_PX = 512
@@ -68,19 +68,11 @@ def photographs(folder: Path, camera: Camera | None, masks: Masks | None = None)
     if not sizes:
         raise InputError(_without_photographs(folder, remarks))
     remarks += _about_subfolders(folder, others)
-    size = (camera.width, camera.height) if camera else max(sizes, key=lambda key: len(sizes[key]))
-    width, height = size
-    if camera is None and width == 2 * height and width >= MIN_PANORAMA_PX:
-        camera = Equirectangular(width, height)
     if camera is None:
-        camera, name = _calibration_in(folder, size)
-        if camera is None:
-            raise InputError(
-                f"{folder}: its photographs are {width} x {height} pixels, so they are not full panoramas (2 to 1); "
-                "give their calibration with --camera FILE."
-            )
-        remarks.append(f"The calibration is {shorten(name)}, which lies beside the photographs.")
-    names = sizes.pop(size, [])
+        camera, about_calibration = _camera_of(folder, sorted(sizes, key=lambda key: -len(sizes[key])))
+        remarks += about_calibration
+    width, height = camera.width, camera.height
+    names = sizes.pop((width, height), [])
     rest = sorted(name for same in sizes.values() for name in same)
     if rest:
         remarks.append(
@@ -89,8 +81,8 @@ def photographs(folder: Path, camera: Camera | None, masks: Masks | None = None)
         )
     if len(names) < MIN_IMAGES:
         raise InputError(
-            f"{folder}: has {len(names)} photographs of {width} x {height} pixels; a map needs {MIN_IMAGES} or more, "
-            "better ten."
+            f"{folder}: has {_counted(len(names), 'photograph')} of {width} x {height} pixels; a map needs "
+            f"{MIN_IMAGES} or more, better ten. {' '.join(remarks)}".rstrip()
         )
     if len(names) > MAX_IMAGES:
         raise InputError(
@@ -139,12 +131,31 @@ def _without_photographs(folder: Path, remarks: Sequence[str]) -> str:
     return f"{folder}: has no photographs ({', '.join(sorted(IMAGES))}); give the folder that has them."
 
 
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
 def _were(count: int, what: str) -> str:
-    return f"{count} {what} was" if count == 1 else f"{count} {what}s were"
+    return f"{_counted(count, what)} {'was' if count == 1 else 'were'}"
 
 
 def _some(names: Sequence[str]) -> str:
     return f"{', '.join(shorten(name) for name in names[:MAX_NAMED])}{', …' if len(names) > MAX_NAMED else ''}"
+
+
+def _camera_of(folder: Path, sizes: Sequence[tuple[int, int]]) -> tuple[Camera, list[str]]:
+    """A camera for the first of the sizes that is a panorama's or has a calibration in the folder, and remarks."""
+    for width, height in sizes:
+        if width == 2 * height and width >= MIN_PANORAMA_PX:
+            return Equirectangular(width, height), []
+        camera, name = _calibration_in(folder, (width, height))
+        if camera is not None:
+            return camera, [f"The calibration is {shorten(name)}, which lies beside the photographs."]
+    width, height = sizes[0]
+    raise InputError(
+        f"{folder}: its photographs are {width} x {height} pixels, so they are not full panoramas (2 to 1); "
+        "give their calibration with --camera FILE."
+    )
 
 
 def _calibration_in(folder: Path, size: tuple[int, int]) -> tuple[Camera | None, str]:

@@ -161,7 +161,7 @@ def test_photographs_that_are_refused_or_left_out(tmp_path, rng):
         photographs(tmp_path, None)
     (tmp_path / "a.png").unlink()
     picture(tmp_path / "b.png", 400, 200, rng)
-    with pytest.raises(InputError, match="has 1 photographs of 400 x 200"):
+    with pytest.raises(InputError, match="has 1 photograph of 400 x 200"):
         photographs(tmp_path, None)
     picture(tmp_path / "c.png", 400, 200, rng)
     picture(tmp_path / "d.png", 300, 200, rng)
@@ -169,6 +169,12 @@ def test_photographs_that_are_refused_or_left_out(tmp_path, rng):
     found = photographs(tmp_path, None)
     assert [view.name for view in found.views] == ["b.png", "c.png"]
     assert len(found.remarks) == 2 and "d.png" in found.remarks[1] and "e.jpg" in found.remarks[0]
+    for name in ("f.png", "g.png", "h.png"):  # more of them, but nothing says what camera they have
+        picture(tmp_path / name, 300, 200, rng)
+    assert [view.name for view in photographs(tmp_path, None).views] == ["b.png", "c.png"]
+    (tmp_path / "c.png").rename(tmp_path / "c.heic")
+    with pytest.raises(InputError, match=r"has 1 photograph of .* convert \.heic to JPEG or PNG\. 4 of 5 images"):
+        photographs(tmp_path, None)
 
 
 def test_nothing_in_a_folder_of_a_stranger_is_left_out_in_silence(tmp_path, rng):
