@@ -8,6 +8,7 @@ from spherloc.geometry import camera_centre
 from spherloc.refine import residuals_px
 from spherloc.trace import ConsensusStage, PositionStage
 from spherloc_viz import style
+from spherloc_viz.app.stage import views
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Segments
 
@@ -56,3 +57,6 @@ def test_each_level_is_a_step(trace):
         gold = (boxes.colors.reshape(len(bound), 12, 3)[:, 0] == style.CLIQUE).all(axis=1)
         np.testing.assert_array_equal(gold, bound == bound.max())
         assert f"up to {bound.max()} of 260" in picture.step.caption
+        view = views.follow(picture, 0.83)
+        seen = views.projected(view, boxes.points.reshape(-1, 3)) / np.tan(view.field_of_view_rad / 2)
+        assert np.all(np.abs(seen) <= [0.83, 1.0]), "all boxes are on the canvas"

@@ -384,6 +384,7 @@ def _level(view: RunView, stage: PositionStage, level: int) -> Frame:
     )
     drawn = f" The {len(boxes)} of them that could explain most are drawn." if len(boxes) < left else ""
     boxes_text = "box is" if left == 1 else "boxes are"
+    edges = _box_edges(boxes, _shades(bound, stage.support))
     return Frame(
         f"{left:,} {boxes_text} left, {view.length(size[0])} to {view.length(size[2])} long, in which a camera might "
         f"explain more than the {stage.support} matches of the best pose; one of them up to {most} of {count}.{end}",
@@ -393,8 +394,8 @@ def _level(view: RunView, stage: PositionStage, level: int) -> Frame:
         view.no_matches(),
         note=f"Colour: from grey, one match more than the best pose, to gold, {most}.{inside}{drawn}",
         located=pose is not None,
-        items=(_box_edges(boxes, _shades(bound, stage.support)),),
-        focus=Focus("Overview", boxes.reshape(-1, 3)),
+        items=(edges,),
+        focus=Focus("Overview", edges.points.reshape(-1, 3)),
     )
 
 
