@@ -112,7 +112,7 @@ def test_a_post_before_the_middle_of_the_subject_is_seen_around(trace: Trace) ->
     middle = subject.mean(axis=0)
     toward = free.position - middle
     post, half_m = middle + 0.3 * toward, 0.03 * float(np.linalg.norm(toward))
-    ground = box(tuple(middle + [-9, 5, -9]), tuple(middle + [9, 5.1, 9]))
+    ground = box(tuple(middle + np.array([-9, 5, -9])), tuple(middle + np.array([9, 5.1, 9])))
     walls = Walls(glb(box(tuple(post - half_m), tuple(post + half_m)), ground), np.eye(3))
     assert not walls.blocked(free.position, subject) and walls.blocked(free.position, middle[None])
     assert not walls.blocked(views.follow(picture, 1.5, walls).position, middle[None])
