@@ -164,8 +164,13 @@ def _image_in(pycolmap: Any, made: Reconstruction, number: int) -> int:
         known = database.read_image(number)
         keypoints = np.asarray(database.read_keypoints(number), np.float64)[:, :2]
         frame = database.read_frame(known.frame_id)
+        camera, rig = database.read_camera(known.camera_id), database.read_rig(frame.rig_id)
     image = pycolmap.Image(name=known.name, keypoints=keypoints, camera_id=known.camera_id, image_id=number)
     image.frame_id = known.frame_id
+    if not model.exists_camera(known.camera_id):
+        model.add_camera(camera)
+    if not model.exists_rig(frame.rig_id):
+        model.add_rig(rig)
     if not model.exists_frame(known.frame_id):
         model.add_frame(frame)
     model.add_image(image)

@@ -23,7 +23,7 @@ from spherloc.mapping.upright import (
     scale_by_height,
     scale_by_positions,
 )
-from spherloc.mapping.written import Kept, Written, write_map
+from spherloc.mapping.written import Kept, Written, cameras_of, write_map
 
 GROUP = "group"
 """Name of the folder, with a number, of a map of images that could not be joined with the rest."""
@@ -67,14 +67,21 @@ def make_map(
     masks: Masks | None = None,
     how: FrontendOptions | None = None,
 ) -> Map:
-    """Make a map of images of one camera and write it into ``folder``.
+    """Make a map of images of one camera or several and write it into ``folder``.
 
-    ``new_images`` is a folder of other images of that camera, for which a scene is written too; ``masks`` are the masks
-    of the views, which are written into the scenes, and ``how`` says which features are matched. Raises ``InputError``
-    if the images give no map, if ``measured`` names other images, or if a file cannot be read or written.
+    ``new_images`` is a folder of other images of the one camera, for which a scene is written too; ``masks`` are the
+    masks of the views, which are written into the scenes, and ``how`` says which features are matched. Raises
+    ``InputError`` if the images give no map, if ``measured`` names other images, if there are new images of several
+    cameras, or if a file cannot be read or written.
     """
     if new_images is not None and not is_folder(new_images):
         raise InputError(f"{new_images}: is not a folder; give one with images that are to be localized.")
+    count = len(cameras_of(views))
+    if new_images is not None and count > 1:
+        raise InputError(
+            f"{new_images}: its images would have one camera, but the photographs have {count}; leave --localize out, "
+            "and write a scene of kind image-folder for them (spherloc scenes image-folder)."
+        )
     names = {view.name for view in views}
     for name in () if measured.distance is None else measured.distance[:2]:
         if name not in names:

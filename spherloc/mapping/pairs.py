@@ -1,4 +1,4 @@
-"""Two-view check: which matches of two images of one camera fit a relative pose, and whether chance explains as many.
+"""Two-view check: which matches of two images fit a relative pose, and whether chance explains as many.
 
 Bearings are compared, so that any lens will do. COLMAP's estimator needs one right match of five or six; where gravity
 is known in both images, samples of three find poses among far fewer right ones. A pose is accepted if chance does not
@@ -44,12 +44,12 @@ MAX_LOG10_NFA = -1.0
 
 
 class Pairs:
-    """The images of one camera, which are compared in pairs, in any thread."""
+    """Images, each with its camera, which are compared in pairs, in any thread."""
 
     def __init__(
         self,
         pycolmap: Any,
-        camera: Camera,
+        cameras: Sequence[Camera],
         features: Sequence[Features],
         usable: Sequence[NDArray[np.int64]],
         gravity: Sequence[Gravity | None],
@@ -59,7 +59,7 @@ class Pairs:
         self._matching = matching
         self._pycolmap = pycolmap
         self._features = features
-        height = round(pi * focal_px(camera))
+        height = round(pi * min(focal_px(camera) for camera in cameras))
         sphere = Equirectangular(2 * height, height)
         bound_px = float(np.clip(BOUND_RAD * sphere.width / tau, *BOUND_PX))
         self._bound_rad = bound_px * tau / sphere.width
@@ -71,7 +71,9 @@ class Pairs:
         self._panorama = pycolmap.Camera(
             model="EQUIRECTANGULAR", width=sphere.width, height=sphere.height, params=[sphere.width, sphere.height]
         )
-        self._bearings = [camera.unproject(one.pixels[index])[0] for one, index in zip(features, usable, strict=True)]
+        self._bearings = [
+            camera.unproject(one.pixels[index])[0] for camera, one, index in zip(cameras, features, usable, strict=True)
+        ]
         self._pixels = [sphere.project(rays)[0] for rays in self._bearings]
         self._words = [_unit(one.descriptors[index]) for one, index in zip(features, usable, strict=True)]
         self._gravity = gravity

@@ -1,6 +1,6 @@
 """The photographs from which a map is made: a folder's images with their camera, or the sharpest frames of a video."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
@@ -44,32 +44,76 @@ class Photographs:
     remarks: tuple[str, ...]
 
 
-def photographs(folder: Path, camera: Camera | None, masks: Masks | None = None) -> Photographs:
-    """The images of a folder, all of ``camera``; if it is None, images of 2 to 1 count as panoramas.
+def photographs(folder: Path, cameras: Mapping[str, Camera], masks: Masks | None = None) -> Photographs:
+    """The images of a folder or, if it has none, of the folders in it, each of which has one camera.
 
-    For other images the folder is searched for a calibration of their size. Pixels that ``masks`` leave out give no
-    features.
+    ``cameras`` are those of a calibration file, by name: a single one is the camera of all images, one of several that
+    of the folder with its name, and the first one that of a folder of images. Where no camera is given, images of 2 to
+    1 count as panoramas, and for others a calibration of their size is sought beside them, and beside their folder
+    under its name. Pixels that ``masks`` leave out give no features.
 
-    Raises ``InputError`` if there are fewer than two images of one size or too many, if no image has a mask, or if
-    their camera is unknown or has no model in COLMAP.
+    Raises ``InputError`` if there are fewer than two images with a camera or too many, if no image has a mask, or if
+    a camera has no model in COLMAP.
     """
     if not is_folder(folder):
         raise InputError(what_it_is(folder) or f"{folder}: is not a folder; give the folder of the photographs.")
     there = names_in(folder)
-    sizes: dict[tuple[int, int], list[str]] = {}
-    damaged, others = [], [name for name in there if not is_image(name)]
-    for name in there:
-        if is_image(name):
+    inside = images_in_folders(folder, [name for name in there if not is_image(name)])
+    views: list[View] = []
+    remarks: list[str] = []
+    if any(is_image(name) for name in there) or not inside:
+        views, remarks = _of_one_camera(folder, "", next(iter(cameras.values()), None))
+        if len(cameras) > 1:
+            first, *others = cameras
+            given = f"The calibration file has {len(cameras)} cameras, of which {first} is taken"
+            remarks.append(f"{given}; --camera-name gives {' or '.join(others)}.")
+        remarks += _about_subfolders(inside)
+    else:
+        for name in sorted(inside):
+            camera = next(iter(cameras.values())) if len(cameras) == 1 else cameras.get(name)
             try:
-                sizes.setdefault(check_image(folder / name), []).append(name)
-            except InputError:
-                damaged.append(name)
+                found, about = _of_one_camera(folder, name, camera)
+            except InputError as error:
+                found, about = [], [f"It is left out. {error}"]
+            views += found
+            remarks += [f"{shorten(name)}: {remark}" for remark in about]
+    if len(views) < MIN_IMAGES:
+        raise InputError(
+            f"{folder}: has {_counted(len(views), 'photograph')} with a known camera; a map needs {MIN_IMAGES} or "
+            f"more, better ten. {' '.join(remarks)}".rstrip()
+        )
+    if len(views) > MAX_IMAGES:
+        raise InputError(
+            f"{folder}: has {len(views)} photographs, more than {MAX_IMAGES}; take every n-th of them, or map "
+            'them with COLMAP and open its model as kind = "colmap".'
+        )
+    if masks is not None:
+        masked, without = masks.on(views)
+        views, remarks = list(masked), [*remarks, *without]
+    return Photographs(tuple(views), tuple(remarks))
+
+
+def _of_one_camera(root: Path, inside: str, camera: Camera | None) -> tuple[list[View], list[str]]:
+    """The images of the folder ``inside`` of ``root``, or of ``root`` itself if that is empty, and remarks on others.
+
+    Raises ``InputError`` if it has none, or if their camera is unknown or has no model in COLMAP.
+    """
+    folder = root / inside
+    sizes: dict[tuple[int, int], list[str]] = {}
+    damaged, others = [], []
+    for name in names_in(folder):
+        if not is_image(name):
+            others.append(name)
+            continue
+        try:
+            sizes.setdefault(check_image(folder / name), []).append(name)
+        except InputError:
+            damaged.append(name)
     remarks = [*_about_damaged(damaged), *_about_unread(others)]
     if not sizes:
         raise InputError(_without_photographs(folder, remarks))
-    remarks += _about_subfolders(folder, others)
     if camera is None:
-        camera, about_calibration = _camera_of(folder, sorted(sizes, key=lambda key: -len(sizes[key])))
+        camera, about_calibration = _camera_of(root, inside, sorted(sizes, key=lambda key: -len(sizes[key])))
         remarks += about_calibration
     width, height = camera.width, camera.height
     names = sizes.pop((width, height), [])
@@ -79,24 +123,11 @@ def photographs(folder: Path, camera: Camera | None, masks: Masks | None = None)
             f"{len(rest)} of {len(rest) + len(names)} images were left out, as they are not {width} x {height} "
             f"pixels; the first is {shorten(rest[0])}."
         )
-    if len(names) < MIN_IMAGES:
-        raise InputError(
-            f"{folder}: has {_counted(len(names), 'photograph')} of {width} x {height} pixels; a map needs "
-            f"{MIN_IMAGES} or more, better ten. {' '.join(remarks)}".rstrip()
-        )
-    if len(names) > MAX_IMAGES:
-        raise InputError(
-            f"{folder}: has {len(names)} photographs, more than {MAX_IMAGES}; take every n-th of them, or map "
-            'them with COLMAP and open its model as kind = "colmap".'
-        )
     camera, about_lens = for_colmap(camera)
     if about_lens:
         remarks.append(about_lens)
-    views = tuple(View(name, camera, folder / name) for name in sorted(names))
-    if masks is not None:
-        views, without = masks.on(views)
-        remarks += without
-    return Photographs(views, tuple(remarks))
+    views = [View((Path(inside) / name).as_posix(), camera, folder / name) for name in sorted(names)]
+    return views, remarks
 
 
 def _about_damaged(names: Sequence[str]) -> list[str]:
@@ -113,12 +144,11 @@ def _about_unread(names: Sequence[str]) -> list[str]:
     return [f"{_were(len(unread), 'photograph')} left out: {_some(unread)}; convert {kinds} to JPEG or PNG."]
 
 
-def _about_subfolders(folder: Path, names: Sequence[str]) -> list[str]:
-    inside = images_in_folders(folder, names)
+def _about_subfolders(inside: Mapping[str, int]) -> list[str]:
     if not inside:
         return []
-    count = sum(inside.values())
-    return [f"{_were(count, 'image')} left out, in subfolders: {_some(list(inside))}; a map is made of one folder."]
+    left = f"{_were(sum(inside.values()), 'image')} left out, in subfolders: {_some(list(inside))}"
+    return [f"{left}; put each camera's images into a folder of its own to have them too."]
 
 
 def _without_photographs(folder: Path, remarks: Sequence[str]) -> str:
@@ -143,14 +173,19 @@ def _some(names: Sequence[str]) -> str:
     return f"{', '.join(shorten(name) for name in names[:MAX_NAMED])}{', …' if len(names) > MAX_NAMED else ''}"
 
 
-def _camera_of(folder: Path, sizes: Sequence[tuple[int, int]]) -> tuple[Camera, list[str]]:
-    """A camera for the first of the sizes that is a panorama's or has a calibration in the folder, and remarks."""
-    for width, height in sizes:
+def _camera_of(root: Path, inside: str, sizes: Sequence[tuple[int, int]]) -> tuple[Camera, list[str]]:
+    """A camera for the first of the sizes that is a panorama's or has a calibration, and remarks."""
+    folder = root / inside
+    for size in sizes:
+        width, height = size
         if width == 2 * height and width >= MIN_PANORAMA_PX:
             return Equirectangular(width, height), []
-        camera, name = _calibration_in(folder, (width, height))
+        camera, name = _calibration_in(folder, size)
         if camera is not None:
             return camera, [f"The calibration is {shorten(name)}, which lies beside the photographs."]
+        camera, name = _calibration_in(root, size, inside) if inside else (None, "")
+        if camera is not None:
+            return camera, [f"The calibration is {shorten(name)}, which lies beside the folder."]
     width, height = sizes[0]
     raise InputError(
         f"{folder}: its photographs are {width} x {height} pixels, so they are not full panoramas (2 to 1); "
@@ -158,9 +193,11 @@ def _camera_of(folder: Path, sizes: Sequence[tuple[int, int]]) -> tuple[Camera, 
     )
 
 
-def _calibration_in(folder: Path, size: tuple[int, int]) -> tuple[Camera | None, str]:
-    """The first camera of that width and height among the files of a folder, and the file's name."""
+def _calibration_in(folder: Path, size: tuple[int, int], stem: str = "") -> tuple[Camera | None, str]:
+    """The first camera of that width and height among the files of a folder, and the file's name; only of files that
+    are called ``stem``, if that is not empty."""
     names = [name for name in names_in(folder) if Path(name).suffix.lower() in CALIBRATIONS]
+    names = [name for name in names if not stem or Path(name).stem == stem]
     for name in names[:MAX_CALIBRATIONS]:
         try:
             camera = load_camera(folder / name)

@@ -117,7 +117,7 @@ def reconstruct(
     tell: Tell,
     how: FrontendOptions | None = None,
 ) -> tuple[Reconstruction, ...]:
-    """Map images of one camera; the database in ``folder`` is kept, and its features and matches are used again.
+    """Map images of one camera or several; the database in ``folder`` is kept, and what it has is used again.
 
     The map with most images comes first, then maps of other images that could not be joined with it.
 
@@ -128,12 +128,12 @@ def reconstruct(
     """
     pycolmap = require("pycolmap", "colmap", "making a map")
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # errors are reported here instead
-    camera, how = views[0].camera, how or FrontendOptions()
+    how = how or FrontendOptions()
     features = []
     for view in views:
         features.append(extract(view, how.features))
         tell("images searched for features", len(features), len(views))
-    usable = [_usable(camera, one.pixels) for one in features]
+    usable = [_usable(view.camera, one.pixels) for view, one in zip(views, features, strict=True)]
     path = folder / f"matches_{_key(views, how)}.db"
     try:
         database = pycolmap.Database.open(str(path))
@@ -141,7 +141,8 @@ def reconstruct(
         raise InputError(f"{path}: cannot be written ({reason(error)}); give another --output.") from None
     try:
         ids = _described(pycolmap, database, views, features, usable)
-        compared = Pairs(pycolmap, camera, features, usable, gravity, how.matching)
+        cameras = [view.camera for view in views]
+        compared = Pairs(pycolmap, cameras, features, usable, gravity, how.matching)
         counts, same_place = _matched(database, ids, compared, _pairs(features), tell)
     finally:
         database.close()
@@ -313,10 +314,10 @@ def _registered(model: Any) -> list[Any]:
 
 def _key(views: Sequence[View], how: FrontendOptions) -> str:
     """Hash of the images and of all that their matches depend on; it names the database."""
-    said = [DATABASE_VERSION, VERSION, how.features.method, how.matching.method, repr(views[0].camera)]
+    said = [DATABASE_VERSION, VERSION, how.features.method, how.matching.method]
     for view in views:
         status = view.path.stat()
-        said += [view.name, status.st_size, status.st_mtime_ns]
+        said += [view.name, status.st_size, status.st_mtime_ns, repr(view.camera)]
         if view.mask is not None:
             said.append(hashlib.sha256(np.packbits(view.usable_pixels()).tobytes()).hexdigest())
     return hashlib.sha256(json.dumps(said).encode()).hexdigest()[:12]
@@ -341,17 +342,14 @@ def _described(
     """Ids of the images in the database; images that are missing there are added with their features."""
     if database.num_images():
         return [database.read_image_with_name(view.name).image_id for view in views]
-    name, parameters = colmap_camera(views[0].camera)
-    width, height = views[0].camera.width, views[0].camera.height
-    camera = pycolmap.Camera(model=name, width=width, height=height, params=parameters)
-    camera.has_prior_focal_length = True  # COLMAP's word for calibrated
-    camera.camera_id = database.write_camera(camera)
-    rig = pycolmap.Rig()
-    rig.add_ref_sensor(camera.sensor_id)
-    rig_id = database.write_rig(rig)
+    written: dict[str, tuple[int, int]] = {}
     ids = []
     for view, found, index in zip(views, features, usable, strict=True):
-        image = pycolmap.Image(name=view.name, camera_id=camera.camera_id)
+        key = repr(view.camera)
+        if key not in written:
+            written[key] = _camera_in(pycolmap, database, view.camera)
+        camera_id, rig_id = written[key]
+        image = pycolmap.Image(name=view.name, camera_id=camera_id)
         image.image_id = database.write_image(image)
         frame = pycolmap.Frame()
         frame.rig_id = rig_id
@@ -360,6 +358,17 @@ def _described(
         database.write_keypoints(image.image_id, found.pixels[index].astype(np.float32))
         ids.append(image.image_id)
     return ids
+
+
+def _camera_in(pycolmap: Any, database: Any, camera: Camera) -> tuple[int, int]:
+    """Ids of a camera, and of a rig of that camera alone, which are written into the database."""
+    name, parameters = colmap_camera(camera)
+    described = pycolmap.Camera(model=name, width=camera.width, height=camera.height, params=parameters)
+    described.has_prior_focal_length = True  # COLMAP's word for calibrated
+    described.camera_id = database.write_camera(described)
+    rig = pycolmap.Rig()
+    rig.add_ref_sensor(described.sensor_id)
+    return described.camera_id, database.write_rig(rig)
 
 
 def _matched(

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from spherloc.cameras.base import Camera
 from spherloc.errors import InputError
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.pipeline import FrontendOptions
@@ -25,7 +26,8 @@ MIN_BOUND_DEG = 3.0
 EVERY = 4
 """Every fourth image of the map is a query of the scene file, localized against the others."""
 MIN_WITHOUT = 4
-"""Least number of a map's images for which queries are left out of the map; in a smaller map all points are used."""
+"""Least number of a map's images for which queries are left out of the map; in a smaller one of one camera all points
+are used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ def write_map(
         (folder / MODEL).mkdir(parents=True, exist_ok=True)
         made.model.write(str(folder / MODEL))
         scene = folder / SCENE
-        if len(names) >= MIN_WITHOUT:
+        if len(names) >= MIN_WITHOUT or len(cameras_of(views)) > 1:
             content = _scene(folder, images, names, about, level, scale)
         else:
             content = _new_scene(folder, images, images, views[0], about, level, scale)
@@ -94,6 +96,11 @@ def write_map(
     except (OSError, RuntimeError) as error:
         raise InputError(f"{folder}: cannot be written ({error}); give another --output.") from None
     return Written(scene, new_scene, poses, made.points(), float(made.model.compute_mean_reprojection_error()))
+
+
+def cameras_of(views: Sequence[View]) -> dict[str, Camera]:
+    """The different cameras of the views, by how they are described."""
+    return {repr(view.camera): view.camera for view in views}
 
 
 def _about(made: Reconstruction, level: Level, scale: Scale, count: int) -> str:

@@ -13,7 +13,7 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ from spherloc.mapping.pairs import MIN_MATCHES
 from spherloc.mapping.photographs import Photographs, frames_of, photographs
 from spherloc.mapping.positions import read_positions
 from spherloc.mapping.upright import Tell
+from spherloc.mapping.written import cameras_of
 from spherloc.registry import require
 from spherloc.types import FloatArray
 from spherloc_viz.commands.progress import progress, say
@@ -52,7 +53,7 @@ which are better placed (``python -m benchmarks.features``)."""
 def make(
     folder: Path,
     output: Path | None,
-    lens: Camera | None,
+    cameras: Mapping[str, Camera],
     video: tuple[Path, int] | None,
     measured: Measured,
     new_images: Path | None,
@@ -63,8 +64,8 @@ def make(
 ) -> int:
     """Make the map, and print the result and what to do next; returns 1 if not all images are in it.
 
-    ``lens`` is the camera, if it is known, ``video`` a file and a number of frames to take from it into ``folder``,
-    ``positions`` a file of where the images were taken, and ``features`` one of ``MAP_FEATURES``. Raises
+    ``cameras`` are those of the calibration file by name, ``video`` a file and a number of frames to take from it into
+    ``folder``, ``positions`` a file of where the images were taken, and ``features`` one of ``MAP_FEATURES``. Raises
     ``InputError``.
     """
     end_without_a_trace()
@@ -73,12 +74,12 @@ def make(
     with _stages() as tell:
         if video is not None:
             _take_frames(*video, folder, tell)
-        found = photographs(folder, lens, masks)
+        found = photographs(folder, cameras, masks)
         if positions is not None:
             measured = Measured(positions=read_positions(positions, found.views))
         for remark in found.remarks:
             say(remark)
-        say(f"{len(found.views)} {_kind(found.views[0])} → {target}. Ctrl-C stops it; the same command goes on.")
+        say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
         made = make_map(found.views, folder, target, measured, new_images, tell, masks, how)
     report = target / REPORT
     try:
@@ -98,20 +99,16 @@ def end_without_a_trace() -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
-def lens_of(file: Path | None, name: str | None) -> Camera | None:
-    """The camera of a calibration file, and a remark if it has several and none is named; None without a file."""
+def cameras_of_file(file: Path | None, name: str | None) -> dict[str, Camera]:
+    """The cameras of a calibration file by name, or the named one alone; none without a file."""
     if file is None:
         if name is not None:
             raise InputError(f"--camera-name {shlex.quote(name)} goes with --camera FILE; give that file too.")
-        return None
+        return {}
     names = camera_names(file)
-    if name is None and len(names) > 1:
-        say(f"{file} has {len(names)} cameras, of which {names[0]} is taken; --camera-name gives {_or(names[1:])}.")
-    return load_camera(file, name)
-
-
-def _or(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"one of {', '.join(names)}"
+    if name is not None or not names:
+        return {name or "": load_camera(file, name)}
+    return {one: load_camera(file, one) for one in names}
 
 
 def how_of(features: str) -> FrontendOptions:
@@ -166,11 +163,13 @@ def _stages() -> Iterator[Tell]:
         yield tell
 
 
-def _kind(view: View) -> str:
-    size = f"{view.camera.width} x {view.camera.height} pixels"
-    return (
-        f"panoramas of {size}" if isinstance(view.camera, Equirectangular) else f"{view.camera.model} images of {size}"
-    )
+def _kind(views: Sequence[View]) -> str:
+    different = cameras_of(views)
+    if len(different) > 1:
+        return f"images of {len(different)} cameras"
+    (camera,) = different.values()
+    size = f"{camera.width} x {camera.height} pixels"
+    return f"panoramas of {size}" if isinstance(camera, Equirectangular) else f"{camera.model} images of {size}"
 
 
 def _units_unknown(made: Map) -> str:
@@ -349,7 +348,7 @@ def _data(kind: str, content: bytes) -> str:
 def main(folder: Path, output: Path) -> int:
     """Make the map of a folder's photographs for a page that started this process; returns the exit code."""
     try:
-        found = photographs(folder, None)
+        found = photographs(folder, {})
         made = make_map(found.views, folder, output, Measured(), None, _progress)
         (output / REPORT).write_text(map_report(made, found), encoding="utf-8")
     except SpherlocError as error:

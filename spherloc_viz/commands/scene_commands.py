@@ -322,9 +322,11 @@ def map(
     spherloc map frames --video walk.mp4 --localize new_photographs
 
     Args:
-        folder: Folder of the photographs; with --video, where its frames are put.
-        camera: Calibration file of the camera; without it, images of 2 to 1 are taken for full panoramas.
-        camera_name: Which camera of that file, if it has several: its first one if not given.
+        folder: Folder of the photographs, or of a folder for each camera; with --video, where its frames are put.
+        camera: Calibration file; without it, images of 2 to 1 are taken for full panoramas, and for others one beside
+            them is sought.
+        camera_name: Which camera of that file all images have; if not given, those of a folder have the camera of its
+            name.
         video: Take frames from this video first, the sharpest of each stretch.
         frames: How many frames to take.
         output: Folder of the map; FOLDER_map here if not given.
@@ -340,7 +342,7 @@ def map(
     """
     from spherloc.frontend.masks import Masks
     from spherloc.mapping.make import Measured
-    from spherloc_viz.commands.map import lens_of, make
+    from spherloc_viz.commands.map import cameras_of_file, make
 
     if sum(one is not None for one in (camera_height, distance, positions)) > 1:
         raise InputError("--camera-height, --distance and --positions all give the scale; keep one.")
@@ -353,8 +355,8 @@ def map(
     masked = any(one is not None for one in (mask, nadir, seam))
     masks = Masks(mask, nadir or 0.0, seam or 0.0) if masked else None
     measured = Measured(camera_height, distance)
-    lens = lens_of(camera, camera_name)
-    return make(folder, output, lens, taken, measured, localize, masks=masks, positions=positions, features=features)
+    cameras = cameras_of_file(camera, camera_name)
+    return make(folder, output, cameras, taken, measured, localize, masks=masks, positions=positions, features=features)
 
 
 def sweep(

@@ -5,7 +5,7 @@ import pytest
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.errors import CalibrationError
-from spherloc_viz.commands.map import lens_of
+from spherloc_viz.commands.map import cameras_of_file
 
 TWO = """# Camera list with one line of data per camera:
 #   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
@@ -39,10 +39,10 @@ def test_a_line_that_cannot_be_used_is_named(tmp_path, line, said):
         load_camera(path)
 
 
-def test_a_map_tells_which_of_several_cameras_it_takes(tmp_path, capsys):
+def test_a_map_gets_the_cameras_of_a_file_by_name(tmp_path):
     path = tmp_path / "cameras.txt"
     path.write_text(TWO)
-    assert lens_of(path, None) == FIRST
-    assert "has 2 cameras, of which 1 is taken; --camera-name gives 3." in capsys.readouterr().err
-    assert lens_of(path, "1") == FIRST
-    assert capsys.readouterr().err == ""
+    found = cameras_of_file(path, None)
+    assert list(found) == ["1", "3"] and found["1"] == FIRST
+    assert list(cameras_of_file(path, "3").values()) == [found["3"]]
+    assert cameras_of_file(None, None) == {}

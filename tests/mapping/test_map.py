@@ -22,7 +22,7 @@ from spherloc.mapping.make import Measured, make_map, scale_of
 from spherloc.mapping.photographs import frames_of, photographs
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
 from spherloc.problem import Problem
-from spherloc_viz.commands.map import main, map_report
+from spherloc_viz.commands.map import _kind, main, map_report
 
 IMAGES = ("reference_002", "reference_003", "reference_004", "reference_005", "reference_006")
 
@@ -42,7 +42,7 @@ def walk(tmp_path_factory):
     first, second = sorted(poses)[:2]
     apart = float(np.linalg.norm(camera_centre(poses[first]) - camera_centre(poses[second])))
     masks = Masks(nadir_deg=12.0)
-    found = photographs(folder, None, masks)
+    found = photographs(folder, {}, masks)
     output = tmp_path_factory.mktemp("map")
     measured = Measured(distance=(first, second, apart))
 
@@ -125,8 +125,72 @@ def test_the_calibration_beside_the_photographs_is_taken(tmp_path, rng):
         words = (f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value}" for key, value in rows.items())
         (tmp_path / name).write_text("[camera]\n" + "\n".join(words))
     (tmp_path / "notes.json").write_text("{}")
-    found = photographs(tmp_path, None)
+    found = photographs(tmp_path, {})
     assert found.views[0].camera.model == "kannala_brandt" and "b.toml" in found.remarks[0]
+
+
+def test_each_folder_of_a_rig_has_its_camera(tmp_path, rng):
+    """By a calibration beside its photographs, by one beside the folder, or by the name of a camera of a file."""
+    lens = KannalaBrandt(400, 300, 90.0, 90.0, 200.0, 150.0, (0.0, 0.0, 0.0, 0.0))
+    other = replace(lens, fx=95.0)
+    for name in ("left", "right", "up"):
+        (tmp_path / name).mkdir()
+        for image in ("1.png", "2.png"):
+            picture(tmp_path / name / image, 400, 300, rng)
+    with pytest.raises(InputError, match=r"0 photographs with a known camera.* left: It is left out\. .*--camera FILE"):
+        photographs(tmp_path, {})
+    (tmp_path / "left" / "lens.toml").write_text(written(lens))
+    (tmp_path / "right.toml").write_text(written(other))
+    found = photographs(tmp_path, {})
+    assert [(view.name, view.camera) for view in found.views] == [
+        ("left/1.png", lens), ("left/2.png", lens), ("right/1.png", other), ("right/2.png", other)
+    ]  # fmt: skip
+    left = [remark.partition(" is")[0] for remark in found.remarks]
+    assert left == ["left: The calibration", "right: The calibration", "up: It"]
+    by_name = photographs(tmp_path, {"left": other, "up": lens})
+    assert [view.camera for view in by_name.views] == [other, other, other, other, lens, lens]
+    assert {view.camera.fx for view in photographs(tmp_path, {"": other}).views} == {95.0}
+    with pytest.raises(InputError, match="the photographs have 2; leave --localize out"):
+        make_map(found.views, tmp_path, tmp_path / "map", Measured(), tmp_path, print)
+
+
+@pytest.fixture(scope="module")
+def rig(walk, tmp_path_factory):
+    """Two fisheyes at each place of the walk, cut from its panorama, one looking a right angle to the left."""
+    poses, panoramas, *_ = walk
+    folder, cut = tmp_path_factory.mktemp("rig"), {}
+    front = KannalaBrandt(480, 480, 150.0, 150.0, 240.0, 240.0, (0.0, 0.0, 0.0, 0.0))
+    left = KannalaBrandt(512, 400, 140.0, 141.0, 250.0, 205.0, (0.01, 0.0, 0.0, 0.0))
+    for camera, name, turn_rad in ((front, "front", 0.0), (left, "left", -np.pi / 2)):
+        (folder / name).mkdir()
+        (folder / f"{name}.toml").write_text(written(camera))
+        panorama_from_camera = so3_exp(np.array([0.0, turn_rad, 0.0]))
+        columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        bearings, seen = camera.unproject(np.column_stack([columns.ravel(), rows.ravel()]))
+        for view in panoramas.views:
+            places, _ = view.camera.project(bearings @ panorama_from_camera.T)
+            u, v = np.where(seen[:, None], places - 0.5, -1.0).astype(np.float32).T.reshape(2, camera.height, -1)
+            cv2.imwrite(str(folder / name / view.name), cv2.remap(view.read(), u, v, cv2.INTER_LINEAR))
+            cut[f"{name}/{view.name}"] = panorama_from_camera.T @ poses[view.name]
+    return folder, cut
+
+
+def test_a_map_of_the_cameras_of_a_rig(rig, tmp_path):
+    folder, poses = rig
+    found = photographs(folder, {})
+    made = make_map(found.views, folder, tmp_path, Measured(), None, lambda *_: None)
+    names = sorted(made.written.poses)
+    assert len(names) >= 9 and len({name.partition("/")[0] for name in names}) == 2
+    first = names[0]
+    for name in names[1:]:
+        turn = made.written.poses[name][:, :3] @ made.written.poses[first][:, :3].T
+        assert rotation_angle(turn @ poses[first][:, :3] @ poses[name][:, :3].T) < np.radians(1.0), name
+    scene = load_scene(made.written.scene)
+    lenses = {view.name: view.camera for view in (*scene.queries, *scene.references)}
+    assert {(lens.width, lens.height) for lens in lenses.values()} == {(480, 480), (512, 400)}
+    problem = scene.problem()
+    assert isinstance(problem, Problem) and problem.truth_inliers.sum() > 30
+    assert "of 2 cameras" in _kind(found.views)
 
 
 def test_a_job_tells_what_went_wrong_in_a_line(tmp_path, rng, capsys):
@@ -141,40 +205,47 @@ def _less(written, name):
     return type(written)(written.scene, written.new_scene, poses, written.points, written.error_px)
 
 
+def written(camera):
+    rows = camera.to_dict().items()
+    return "[camera]\n" + "\n".join(f"{key} = {json.dumps(value)}" for key, value in rows)
+
+
 def picture(path, width, height, rng):
     assert cv2.imwrite(str(path), rng.integers(0, 255, (height, width), np.uint8))
 
 
 def test_photographs_that_are_refused_or_left_out(tmp_path, rng):
     with pytest.raises(InputError, match="is not a folder"):
-        photographs(tmp_path / "none", None)
+        photographs(tmp_path / "none", {})
     (tmp_path / "walk.mp4").write_bytes(b"")
     with pytest.raises(InputError, match=r"is a video; .* spherloc map frames --video .*walk\.mp4$"):
-        photographs(tmp_path / "walk.mp4", None)
+        photographs(tmp_path / "walk.mp4", {})
     with pytest.raises(InputError, match=r"is a folder of 1 video; .* spherloc map frames --video .*walk\.mp4$"):
-        photographs(tmp_path, None)
+        photographs(tmp_path, {})
     (tmp_path / "walk.mp4").unlink()
     with pytest.raises(InputError, match="has no photographs"):
-        photographs(tmp_path, None)
+        photographs(tmp_path, {})
     picture(tmp_path / "a.png", 400, 300, rng)
     with pytest.raises(InputError, match=r"400 x 300 pixels.*--camera FILE"):
-        photographs(tmp_path, None)
+        photographs(tmp_path, {})
     (tmp_path / "a.png").unlink()
     picture(tmp_path / "b.png", 400, 200, rng)
-    with pytest.raises(InputError, match="has 1 photograph of 400 x 200"):
-        photographs(tmp_path, None)
+    with pytest.raises(InputError, match="has 1 photograph with a known camera"):
+        photographs(tmp_path, {})
     picture(tmp_path / "c.png", 400, 200, rng)
     picture(tmp_path / "d.png", 300, 200, rng)
     (tmp_path / "e.jpg").write_bytes(b"no image")
-    found = photographs(tmp_path, None)
+    found = photographs(tmp_path, {})
     assert [view.name for view in found.views] == ["b.png", "c.png"]
     assert len(found.remarks) == 2 and "d.png" in found.remarks[1] and "e.jpg" in found.remarks[0]
+    several = {"cam0": found.views[0].camera, "cam1": found.views[0].camera}
+    assert "2 cameras, of which cam0 is taken; --camera-name gives cam1." in photographs(tmp_path, several).remarks[-1]
     for name in ("f.png", "g.png", "h.png"):  # more of them, but nothing says what camera they have
         picture(tmp_path / name, 300, 200, rng)
-    assert [view.name for view in photographs(tmp_path, None).views] == ["b.png", "c.png"]
+    assert [view.name for view in photographs(tmp_path, {}).views] == ["b.png", "c.png"]
     (tmp_path / "c.png").rename(tmp_path / "c.heic")
-    with pytest.raises(InputError, match=r"has 1 photograph of .* convert \.heic to JPEG or PNG\. 4 of 5 images"):
-        photographs(tmp_path, None)
+    with pytest.raises(InputError, match=r"has 1 photograph with .* convert \.heic to JPEG or PNG\. 4 of 5 images"):
+        photographs(tmp_path, {})
 
 
 def test_nothing_in_a_folder_of_a_stranger_is_left_out_in_silence(tmp_path, rng):
@@ -186,7 +257,7 @@ def test_nothing_in_a_folder_of_a_stranger_is_left_out_in_silence(tmp_path, rng)
     picture(tmp_path / "inside" / "f.png", 400, 200, rng)
     for name in ("IMG_1.HEIC", "._b.png", "notes.txt"):
         (tmp_path / name).write_bytes(b"Mac OS X")
-    found = photographs(tmp_path, None)
+    found = photographs(tmp_path, {})
     assert [view.name for view in found.views] == ["Büro am Fenster.JPG", "b.png"]
     assert [remark.partition(":")[0] for remark in found.remarks] == [
         "1 image was left out, damaged or empty",
@@ -196,14 +267,13 @@ def test_nothing_in_a_folder_of_a_stranger_is_left_out_in_silence(tmp_path, rng)
     assert "cut.jpg" in found.remarks[0] and "convert .heic" in found.remarks[1] and "inside" in found.remarks[2]
 
 
-def test_a_folder_without_photographs_says_what_there_is(tmp_path, rng):
+def test_a_folder_without_photographs_says_what_there_is(tmp_path):
     (tmp_path / "left").mkdir()
-    picture(tmp_path / "left" / "a.png", 400, 200, rng)
-    with pytest.raises(InputError, match=r"with 1 in the folders in it; make a map .*: spherloc map \S*left$"):
-        photographs(tmp_path, None)
+    with pytest.raises(InputError, match="has no photographs"):
+        photographs(tmp_path, {})
     (tmp_path / "a.heic").write_bytes(b"")
     with pytest.raises(InputError, match=r"no photographs that can be read\. .*convert \.heic to JPEG"):
-        photographs(tmp_path, None)
+        photographs(tmp_path, {})
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no termination signal")
@@ -216,7 +286,7 @@ def test_a_terminated_map_prints_no_stack_trace():
 def test_images_that_show_nothing_together(tmp_path, rng):
     for name in ("a.png", "b.png"):
         picture(tmp_path / name, 400, 200, rng)
-    found = photographs(tmp_path, None)
+    found = photographs(tmp_path, {})
     with pytest.raises(InputError, match=r"'z\.png' is not one of the 2 photographs"):
         make_map(found.views, tmp_path, tmp_path / "map", Measured(distance=("a.png", "z.png", 1.0)), None, print)
     with pytest.raises(InputError, match="no two of the 2 photographs show the same place"):
