@@ -74,7 +74,9 @@ def photographs(folder: Path, cameras: Mapping[str, Camera], masks: Masks | None
             try:
                 found, about = _of_one_camera(folder, name, camera)
             except InputError as error:
-                found, about = [], [f"It is left out. {error}"]
+                named = f" The calibration file's cameras are {' and '.join(cameras)}." if len(cameras) > 1 else ""
+                remarks.append(f"The folder {shorten(name)} is left out: {error}{named}")
+                continue
             views += found
             remarks += [f"{shorten(name)}: {remark}" for remark in about]
     if len(views) < MIN_IMAGES:
@@ -189,7 +191,7 @@ def _camera_of(root: Path, inside: str, sizes: Sequence[tuple[int, int]]) -> tup
     width, height = sizes[0]
     raise InputError(
         f"{folder}: its photographs are {width} x {height} pixels, so they are not full panoramas (2 to 1); "
-        "give their calibration with --camera FILE."
+        f"give their calibration with --camera FILE{f', which calls it {inside}' if inside else ''}."
     )
 
 

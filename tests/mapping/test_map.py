@@ -137,7 +137,7 @@ def test_each_folder_of_a_rig_has_its_camera(tmp_path, rng):
         (tmp_path / name).mkdir()
         for image in ("1.png", "2.png"):
             picture(tmp_path / name / image, 400, 300, rng)
-    with pytest.raises(InputError, match=r"0 photographs with a known camera.* left: It is left out\. .*--camera FILE"):
+    with pytest.raises(InputError, match=r"0 photographs with .* The folder left is left out: .*--camera FILE, which "):
         photographs(tmp_path, {})
     (tmp_path / "left" / "lens.toml").write_text(written(lens))
     (tmp_path / "right.toml").write_text(written(other))
@@ -145,8 +145,10 @@ def test_each_folder_of_a_rig_has_its_camera(tmp_path, rng):
     assert [(view.name, view.camera) for view in found.views] == [
         ("left/1.png", lens), ("left/2.png", lens), ("right/1.png", other), ("right/2.png", other)
     ]  # fmt: skip
-    left = [remark.partition(" is")[0] for remark in found.remarks]
-    assert left == ["left: The calibration", "right: The calibration", "up: It"]
+    left = [remark.partition(" is ")[0] for remark in found.remarks]
+    assert left == ["left: The calibration", "right: The calibration", "The folder up"]
+    others = photographs(tmp_path, {"cam0": lens, "cam1": other})
+    assert others.remarks[-1].endswith("which calls it up. The calibration file's cameras are cam0 and cam1.")
     by_name = photographs(tmp_path, {"left": other, "up": lens})
     assert [view.camera for view in by_name.views] == [other, other, other, other, lens, lens]
     assert {view.camera.fx for view in photographs(tmp_path, {"": other}).views} == {95.0}
