@@ -88,7 +88,7 @@ def _folder(path: Path) -> tuple[str, str]:
     inside = images_in_folders(path, names)
     if inside:
         what = f"a folder without images, but with {sum(inside.values()):,} in the folders in it"
-        return what, f"make a map of them, a folder for each camera, with: spherloc map {_quoted(path)}"
+        return what, f"make a map of them with: spherloc map {_quoted(path)}"
     scenes = [name for name in names if name.endswith(".toml")]
     if scenes:
         return _counted(len(scenes), "scene file"), f"give one of them, such as {shorten(str(path / scenes[0]))}"

@@ -1,4 +1,4 @@
-"""The photographs from which a map is made: a folder's images with their camera, or the sharpest frames of a video."""
+"""The photographs from which a map is made: a folder's images with their cameras, or the sharpest frames of a video."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from spherloc.cameras.base import Camera
-from spherloc.cameras.calibration import load_camera
+from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.given_path import SCENE, images_in_folders, what_it_is
 from spherloc.errors import InputError, SpherlocError, shorten
@@ -45,12 +45,12 @@ class Photographs:
 
 
 def photographs(folder: Path, cameras: Mapping[str, Camera], masks: Masks | None = None) -> Photographs:
-    """The images of a folder or, if it has none, of the folders in it, each of which has one camera.
+    """The images of a folder or, if it has none, of the folders in it, with their cameras.
 
-    ``cameras`` are those of a calibration file, by name: a single one is the camera of all images, one of several that
-    of the folder with its name, and the first one that of a folder of images. Where no camera is given, images of 2 to
-    1 count as panoramas, and for others a calibration of their size is sought beside them, and beside their folder
-    under its name. Pixels that ``masks`` leave out give no features.
+    ``cameras`` are those of a calibration file, by name; without them, calibrations beside the images are taken, and
+    for a folder in ``folder`` also one beside it that has its name. A single camera is that of all images. Of several
+    with the size of an image it is the one whose name is in the image's name, or that of its folder. Images of 2 to 1
+    count as panoramas where no camera has their size. Pixels that ``masks`` leave out give no features.
 
     Raises ``InputError`` if there are fewer than two images with a camera or too many, if no image has a mask, or if
     a camera has no model in COLMAP.
@@ -62,21 +62,14 @@ def photographs(folder: Path, cameras: Mapping[str, Camera], masks: Masks | None
     views: list[View] = []
     remarks: list[str] = []
     if any(is_image(name) for name in there) or not inside:
-        views, remarks = _of_one_camera(folder, "", next(iter(cameras.values()), None))
-        if len(cameras) > 1:
-            first, *others = cameras
-            given = f"The calibration file has {len(cameras)} cameras, of which {first} is taken"
-            remarks.append(f"{given}; --camera-name gives {' or '.join(others)}.")
+        views, remarks = _of_folder(folder, "", cameras)
         remarks += _about_subfolders(inside)
     else:
         for name in sorted(inside):
-            camera = next(iter(cameras.values())) if len(cameras) == 1 else cameras.get(name)
             try:
-                found, about = _of_one_camera(folder, name, camera)
+                found, about = _of_folder(folder, name, {name: cameras[name]} if name in cameras else cameras)
             except InputError as error:
-                named = f" The calibration file's cameras are {' and '.join(cameras)}." if len(cameras) > 1 else ""
-                remarks.append(f"The folder {shorten(name)} is left out: {error}{named}")
-                continue
+                found, about = [], [f"It is left out: {error}"]
             views += found
             remarks += [f"{shorten(name)}: {remark}" for remark in about]
     if len(views) < MIN_IMAGES:
@@ -95,7 +88,7 @@ def photographs(folder: Path, cameras: Mapping[str, Camera], masks: Masks | None
     return Photographs(tuple(views), tuple(remarks))
 
 
-def _of_one_camera(root: Path, inside: str, camera: Camera | None) -> tuple[list[View], list[str]]:
+def _of_folder(root: Path, inside: str, given: Mapping[str, Camera]) -> tuple[list[View], list[str]]:
     """The images of the folder ``inside`` of ``root``, or of ``root`` itself if that is empty, and remarks on others.
 
     Raises ``InputError`` if it has none, or if their camera is unknown or has no model in COLMAP.
@@ -114,22 +107,82 @@ def _of_one_camera(root: Path, inside: str, camera: Camera | None) -> tuple[list
     remarks = [*_about_damaged(damaged), *_about_unread(others)]
     if not sizes:
         raise InputError(_without_photographs(folder, remarks))
-    if camera is None:
-        camera, about_calibration = _camera_of(root, inside, sorted(sizes, key=lambda key: -len(sizes[key])))
-        remarks += about_calibration
-    width, height = camera.width, camera.height
-    names = sizes.pop((width, height), [])
-    rest = sorted(name for same in sizes.values() for name in same)
-    if rest:
-        remarks.append(
-            f"{len(rest)} of {len(rest) + len(names)} images were left out, as they are not {width} x {height} "
-            f"pixels; the first is {shorten(rest[0])}."
+    cameras = given or _beside(root, inside)
+    camera_of: dict[str, Camera] = {}
+    for size, names in sizes.items():
+        found, about = _with_cameras(names, size, cameras)
+        if not given and not found and size[0] == 2 * size[1] >= MIN_PANORAMA_PX:
+            found = dict.fromkeys(names, Equirectangular(*size))
+        camera_of |= found
+        remarks += about
+    used = [name for name, camera in cameras.items() if any(camera is one for one in camera_of.values())]
+    if used and not given:
+        remarks.append(f"The calibration found beside them: {', '.join(map(shorten, used))}.")
+    rest = sorted(name for names in sizes.values() for name in names if name not in camera_of)
+    if rest and not camera_of and not given:
+        width, height = max(sizes, key=lambda size: len(sizes[size]))
+        raise InputError(
+            f"{folder}: its photographs are {width} x {height} pixels, so they are not full panoramas (2 to 1); "
+            "give their calibration with --camera FILE."
         )
-    camera, about_lens = for_colmap(camera)
-    if about_lens:
-        remarks.append(about_lens)
-    views = [View((Path(inside) / name).as_posix(), camera, folder / name) for name in sorted(names)]
+    if rest:
+        width, height = next(size for size, names in sizes.items() if rest[0] in names)
+        remarks.append(
+            f"{len(rest)} of {len(rest) + len(camera_of)} images were left out, as their camera is not known; the "
+            f"first is {shorten(rest[0])} with {width} x {height} pixels."
+        )
+    for_model: dict[str, Camera] = {}
+    for camera in camera_of.values():
+        if repr(camera) not in for_model:
+            for_model[repr(camera)], about_lens = for_colmap(camera)
+            remarks += [about_lens] if about_lens else []
+    views = [
+        View((Path(inside) / name).as_posix(), for_model[repr(camera_of[name])], folder / name)
+        for name in sorted(camera_of)
+    ]
     return views, remarks
+
+
+def _with_cameras(
+    names: Sequence[str], size: tuple[int, int], cameras: Mapping[str, Camera]
+) -> tuple[dict[str, Camera], list[str]]:
+    """The cameras of images of one size, by the image's name, and remarks."""
+    fitting = {name: camera for name, camera in cameras.items() if (camera.width, camera.height) == size}
+    if not fitting:
+        return {}, []
+    if len({repr(camera) for camera in fitting.values()}) == 1:
+        return dict.fromkeys(names, next(iter(fitting.values()))), []
+    found = {}
+    for name in names:
+        called = [camera for camera in fitting if _plain(camera) in _plain(name)]
+        if called:
+            found[name] = fitting[max(called, key=len)]
+    if found:
+        return found, []
+    first, *others = fitting
+    taken = f"Camera {shorten(first)} is taken for all images of {size[0]} x {size[1]} pixels"
+    choice = "to choose, name the images or their folder after their camera, or give --camera-name"
+    return dict.fromkeys(names, fitting[first]), [f"{taken}, but {_some(others)} would fit, too; {choice}."]
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", "-")
+
+
+def _beside(root: Path, inside: str) -> dict[str, Camera]:
+    """Cameras of the calibration files in a folder, and of one beside it that has its name, by the name of the file or,
+    if it has several, of the camera in it."""
+    files = [root / inside / name for name in names_in(root / inside)]
+    files += [root / name for name in names_in(root) if inside and Path(name).stem == inside]
+    found: dict[str, Camera] = {}
+    for path in [path for path in files if path.suffix.lower() in CALIBRATIONS][:MAX_CALIBRATIONS]:
+        try:
+            names = camera_names(path)
+            many = {name: load_camera(path, name) for name in names} if len(names) > 1 else {}
+            found |= many or {path.stem: load_camera(path)}
+        except SpherlocError:  # not a calibration
+            continue
+    return found
 
 
 def _about_damaged(names: Sequence[str]) -> list[str]:
@@ -173,41 +226,6 @@ def _were(count: int, what: str) -> str:
 
 def _some(names: Sequence[str]) -> str:
     return f"{', '.join(shorten(name) for name in names[:MAX_NAMED])}{', …' if len(names) > MAX_NAMED else ''}"
-
-
-def _camera_of(root: Path, inside: str, sizes: Sequence[tuple[int, int]]) -> tuple[Camera, list[str]]:
-    """A camera for the first of the sizes that is a panorama's or has a calibration, and remarks."""
-    folder = root / inside
-    for size in sizes:
-        width, height = size
-        if width == 2 * height and width >= MIN_PANORAMA_PX:
-            return Equirectangular(width, height), []
-        camera, name = _calibration_in(folder, size)
-        if camera is not None:
-            return camera, [f"The calibration is {shorten(name)}, which lies beside the photographs."]
-        camera, name = _calibration_in(root, size, inside) if inside else (None, "")
-        if camera is not None:
-            return camera, [f"The calibration is {shorten(name)}, which lies beside the folder."]
-    width, height = sizes[0]
-    raise InputError(
-        f"{folder}: its photographs are {width} x {height} pixels, so they are not full panoramas (2 to 1); "
-        f"give their calibration with --camera FILE{f', which calls it {inside}' if inside else ''}."
-    )
-
-
-def _calibration_in(folder: Path, size: tuple[int, int], stem: str = "") -> tuple[Camera | None, str]:
-    """The first camera of that width and height among the files of a folder, and the file's name; only of files that
-    are called ``stem``, if that is not empty."""
-    names = [name for name in names_in(folder) if Path(name).suffix.lower() in CALIBRATIONS]
-    names = [name for name in names if not stem or Path(name).stem == stem]
-    for name in names[:MAX_CALIBRATIONS]:
-        try:
-            camera = load_camera(folder / name)
-        except SpherlocError:  # not a calibration
-            continue
-        if (camera.width, camera.height) == size:
-            return camera, name
-    return None, ""
 
 
 def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], None]) -> int:

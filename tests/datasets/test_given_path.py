@@ -21,7 +21,7 @@ def filled(folder, *names):
         ([f"{k}.JPG" for k in range(3)], "is a folder of 3 images; make a map of it with: spherloc map "),
         (
             ["left/1.png", "right/1.png", "scene.toml"],
-            "without images, but with 2 in the folders in it; make a map of them, a folder for each camera, with: ",
+            "is a folder without images, but with 2 in the folders in it; make a map of them with: spherloc ",
         ),
         (["1.png"], "is a folder of 1 image; make a map"),
         (["cameras.bin", "images.bin", "points3D.bin", "frames.bin"], "is a COLMAP model; a scene of kind colmap"),

@@ -126,18 +126,19 @@ def test_the_calibration_beside_the_photographs_is_taken(tmp_path, rng):
         (tmp_path / name).write_text("[camera]\n" + "\n".join(words))
     (tmp_path / "notes.json").write_text("{}")
     found = photographs(tmp_path, {})
-    assert found.views[0].camera.model == "kannala_brandt" and "b.toml" in found.remarks[0]
+    assert [view.camera.width for view in found.views] == [400, 400]
+    assert found.remarks == ("The calibration found beside them: b.",)
 
 
-def test_each_folder_of_a_rig_has_its_camera(tmp_path, rng):
-    """By a calibration beside its photographs, by one beside the folder, or by the name of a camera of a file."""
+def test_each_image_of_a_rig_has_its_camera(tmp_path, rng):
+    """In folders by a calibration in it, by one beside it, or by the name of a camera of a file; else by its name."""
     lens = KannalaBrandt(400, 300, 90.0, 90.0, 200.0, 150.0, (0.0, 0.0, 0.0, 0.0))
     other = replace(lens, fx=95.0)
     for name in ("left", "right", "up"):
         (tmp_path / name).mkdir()
         for image in ("1.png", "2.png"):
             picture(tmp_path / name / image, 400, 300, rng)
-    with pytest.raises(InputError, match=r"0 photographs with .* The folder left is left out: .*--camera FILE, which "):
+    with pytest.raises(InputError, match=r"0 photographs with .* left: It is left out: .*--camera FILE\."):
         photographs(tmp_path, {})
     (tmp_path / "left" / "lens.toml").write_text(written(lens))
     (tmp_path / "right.toml").write_text(written(other))
@@ -145,15 +146,34 @@ def test_each_folder_of_a_rig_has_its_camera(tmp_path, rng):
     assert [(view.name, view.camera) for view in found.views] == [
         ("left/1.png", lens), ("left/2.png", lens), ("right/1.png", other), ("right/2.png", other)
     ]  # fmt: skip
-    left = [remark.partition(" is ")[0] for remark in found.remarks]
-    assert left == ["left: The calibration", "right: The calibration", "The folder up"]
-    others = photographs(tmp_path, {"cam0": lens, "cam1": other})
-    assert others.remarks[-1].endswith("which calls it up. The calibration file's cameras are cam0 and cam1.")
+    assert found.remarks[:2] == (
+        "left: The calibration found beside them: lens.",
+        "right: The calibration found beside them: right.",
+    )
+    assert found.remarks[2].startswith("up: It is left out: ")
     by_name = photographs(tmp_path, {"left": other, "up": lens})
-    assert [view.camera for view in by_name.views] == [other, other, other, other, lens, lens]
+    assert [view.camera for view in by_name.views if "right" not in view.name] == [other, other, lens, lens]
+    assert "right: Camera left is taken for all images of 400 x 300 pixels, but up would fit" in " ".join(
+        by_name.remarks
+    )
     assert {view.camera.fx for view in photographs(tmp_path, {"": other}).views} == {95.0}
     with pytest.raises(InputError, match="the photographs have 2; leave --localize out"):
         make_map(found.views, tmp_path, tmp_path / "map", Measured(), tmp_path, print)
+
+    flat = tmp_path / "flat"
+    flat.mkdir()
+    for name in ("camera-slam-left_1.png", "camera-slam-right_1.png", "else.png"):
+        picture(flat / name, 400, 300, rng)
+    picture(flat / "panorama.png", 400, 200, rng)
+    (flat / "slam_left.toml").write_text(written(lens))
+    (flat / "slam_right.toml").write_text(written(other))
+    found = photographs(flat, {})
+    assert [view.camera.model for view in found.views] == ["kannala_brandt", "kannala_brandt", "equirectangular"]
+    assert [view.camera for view in found.views][:2] == [lens, other]
+    assert found.remarks == (
+        "The calibration found beside them: slam_left, slam_right.",
+        "1 of 4 images were left out, as their camera is not known; the first is else.png with 400 x 300 pixels.",
+    )
 
 
 @pytest.fixture(scope="module")
@@ -240,8 +260,6 @@ def test_photographs_that_are_refused_or_left_out(tmp_path, rng):
     found = photographs(tmp_path, {})
     assert [view.name for view in found.views] == ["b.png", "c.png"]
     assert len(found.remarks) == 2 and "d.png" in found.remarks[1] and "e.jpg" in found.remarks[0]
-    several = {"cam0": found.views[0].camera, "cam1": found.views[0].camera}
-    assert "2 cameras, of which cam0 is taken; --camera-name gives cam1." in photographs(tmp_path, several).remarks[-1]
     for name in ("f.png", "g.png", "h.png"):  # more of them, but nothing says what camera they have
         picture(tmp_path / name, 300, 200, rng)
     assert [view.name for view in photographs(tmp_path, {}).views] == ["b.png", "c.png"]
