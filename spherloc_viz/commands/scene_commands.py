@@ -323,10 +323,8 @@ def map(
 
     Args:
         folder: Folder of the photographs, or of a folder for each camera; with --video, where its frames are put.
-        camera: Calibration file; without it, images of 2 to 1 are taken for full panoramas, and for others one beside
-            them is sought.
-        camera_name: Which camera of that file all images have; if not given, those of a folder have the camera of its
-            name.
+        camera: Calibration file; without it, those beside the images are taken, and others of 2 to 1 are panoramas.
+        camera_name: Which camera of that file all images have; otherwise their name or their folder's says it.
         video: Take frames from this video first, the sharpest of each stretch.
         frames: How many frames to take.
         output: Folder of the map; FOLDER_map here if not given.
