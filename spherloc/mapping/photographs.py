@@ -16,7 +16,7 @@ from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
-from spherloc.images import check_image, grey
+from spherloc.images import check_image, grey, read_image
 from spherloc.mapping.lens import for_colmap
 from spherloc.types import ByteArray
 
@@ -32,6 +32,8 @@ MAX_NAMED = 3
 CALIBRATIONS = (".yaml", ".yml", ".json", ".toml", ".txt")
 MAX_CALIBRATIONS = 20
 """Largest number of files beside the photographs that are tried as a calibration."""
+BLACK = 16
+"""Largest grey value of what no light has reached, after JPEG compression."""
 SHARPNESS_PX = 512
 """Frames are scaled to this longer side before their sharpness is compared."""
 
@@ -112,7 +114,9 @@ def _of_folder(root: Path, inside: str, given: Mapping[str, Camera]) -> tuple[li
     for size, names in sizes.items():
         found, about = _with_cameras(names, size, cameras)
         if not given and not found and size[0] == 2 * size[1] >= MIN_PANORAMA_PX:
-            found = dict.fromkeys(names, Equirectangular(*size))
+            raw = [name for name in names if two_circles(read_image(folder / name))]
+            found = {name: Equirectangular(*size) for name in names if name not in raw}
+            remarks += _about_raw(raw)
         camera_of |= found
         remarks += about
     used = [name for name, camera in cameras.items() if any(camera is one for one in camera_of.values())]
@@ -191,6 +195,15 @@ def _about_damaged(names: Sequence[str]) -> list[str]:
     return [f"{_were(len(names), 'image')} left out, damaged or empty: {_some(names)}; copy again what is needed."]
 
 
+def _about_raw(names: Sequence[str]) -> list[str]:
+    if not names:
+        return []
+    return [
+        f"{_were(len(names), 'image')} left out, two fisheye circles side by side and no panorama: {_some(names)}; "
+        "have the camera's own program stitch them."
+    ]
+
+
 def _about_unread(names: Sequence[str]) -> list[str]:
     unread = [name for name in names if Path(name).suffix.lower() in UNREAD and not name.startswith(".")]
     if not unread:
@@ -226,6 +239,21 @@ def _were(count: int, what: str) -> str:
 
 def _some(names: Sequence[str]) -> str:
     return f"{', '.join(shorten(name) for name in names[:MAX_NAMED])}{', …' if len(names) > MAX_NAMED else ''}"
+
+
+def two_circles(image: ByteArray) -> bool:
+    """Whether an image (H, W) or (H, W, 3) of 2 to 1 shows the raw circles of two fisheyes: both halves are black in
+    their corners and not in the rows between. A panorama has its zenith along the whole upper edge, and its nadir along
+    the lower one."""
+    height = image.shape[0]
+    side, middle = max(2, height // 20), height // 2
+    for half in np.split(grey(image)[:, : 4 * (height // 2)], 2, axis=1):
+        for edge in (half, half[::-1]):
+            corners = np.hstack([edge[:side, :side], edge[:side, -side:]])
+            between = edge[side // 2 : side, middle - side : middle + side]
+            if np.percentile(corners, 90) > BLACK or between.mean() <= 2 * BLACK:
+                return False
+    return True
 
 
 def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], None]) -> int:

@@ -19,7 +19,7 @@ from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.make import Measured, make_map, scale_of
-from spherloc.mapping.photographs import frames_of, photographs
+from spherloc.mapping.photographs import frames_of, photographs, two_circles
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
 from spherloc.problem import Problem
 from spherloc_viz.commands.map import _kind, main, map_report
@@ -285,6 +285,22 @@ def test_nothing_in_a_folder_of_a_stranger_is_left_out_in_silence(tmp_path, rng)
         "1 image was left out, in subfolders",
     ]
     assert "cut.jpg" in found.remarks[0] and "convert .heic" in found.remarks[1] and "inside" in found.remarks[2]
+
+
+def test_raw_images_of_a_360_degree_camera_are_no_panoramas(tmp_path, rng):
+    """Nor are panoramas raw whose zenith and nadir are black, or that were taken at night."""
+    v, u = np.mgrid[:200, :400]
+    circle = np.hypot(u % 200 - 99.5, v - 99.5) < 99
+    room = rng.integers(60, 255, (200, 400), np.uint8)
+    bands = np.abs(v - 100) < 80
+    assert two_circles(np.where(circle, room, 5).astype(np.uint8))
+    for panorama in (room, np.where(bands, room, 0).astype(np.uint8), room // 40):
+        assert not two_circles(panorama)
+    for name, pixels in (("a.png", room), ("b.png", room), ("raw.png", np.where(circle, room, 5))):
+        cv2.imwrite(str(tmp_path / name), pixels)
+    found = photographs(tmp_path, {})
+    assert [view.name for view in found.views] == ["a.png", "b.png"]
+    assert "two fisheye circles side by side and no panorama: raw.png" in found.remarks[0]
 
 
 def test_a_folder_without_photographs_says_what_there_is(tmp_path):
