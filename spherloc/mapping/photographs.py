@@ -46,13 +46,16 @@ class Photographs:
     remarks: tuple[str, ...]
 
 
-def photographs(folder: Path, cameras: Mapping[str, Camera], masks: Masks | None = None) -> Photographs:
+def photographs(
+    folder: Path, cameras: Mapping[str, Camera], masks: Masks | None = None, panorama: bool = False
+) -> Photographs:
     """The images of a folder or, if it has none, of the folders in it, with their cameras.
 
     ``cameras`` are those of a calibration file, by name; without them, calibrations beside the images are taken, and
     for a folder in ``folder`` also one beside it that has its name. A single camera is that of all images. Of several
     with the size of an image it is the one whose name is in the image's name, or that of its folder. Images of 2 to 1
-    count as panoramas where no camera has their size. Pixels that ``masks`` leave out give no features.
+    count as panoramas where no camera has their size, and if ``panorama`` in any case. Pixels that ``masks`` leave out
+    give no features.
 
     Raises ``InputError`` if there are fewer than two images with a camera or too many, if no image has a mask, or if
     a camera has no model in COLMAP.
@@ -64,12 +67,13 @@ def photographs(folder: Path, cameras: Mapping[str, Camera], masks: Masks | None
     views: list[View] = []
     remarks: list[str] = []
     if any(is_image(name) for name in there) or not inside:
-        views, remarks = _of_folder(folder, "", cameras)
+        views, remarks = _of_folder(folder, "", cameras, panorama)
         remarks += _about_subfolders(inside)
     else:
         for name in sorted(inside):
             try:
-                found, about = _of_folder(folder, name, {name: cameras[name]} if name in cameras else cameras)
+                own = {name: cameras[name]} if name in cameras else cameras
+                found, about = _of_folder(folder, name, own, panorama)
             except InputError as error:
                 found, about = [], [f"It is left out: {error}"]
             views += found
@@ -90,7 +94,7 @@ def photographs(folder: Path, cameras: Mapping[str, Camera], masks: Masks | None
     return Photographs(tuple(views), tuple(remarks))
 
 
-def _of_folder(root: Path, inside: str, given: Mapping[str, Camera]) -> tuple[list[View], list[str]]:
+def _of_folder(root: Path, inside: str, given: Mapping[str, Camera], panorama: bool) -> tuple[list[View], list[str]]:
     """The images of the folder ``inside`` of ``root``, or of ``root`` itself if that is empty, and remarks on others.
 
     Raises ``InputError`` if it has none, or if their camera is unknown or has no model in COLMAP.
@@ -109,12 +113,12 @@ def _of_folder(root: Path, inside: str, given: Mapping[str, Camera]) -> tuple[li
     remarks = [*_about_damaged(damaged), *_about_unread(others)]
     if not sizes:
         raise InputError(_without_photographs(folder, remarks))
-    cameras = given or _beside(root, inside)
+    cameras = given if given or panorama else _beside(root, inside)
     camera_of: dict[str, Camera] = {}
     for size, names in sizes.items():
         found, about = _with_cameras(names, size, cameras)
         if not given and not found and size[0] == 2 * size[1] >= MIN_PANORAMA_PX:
-            raw = [name for name in names if two_circles(read_image(folder / name))]
+            raw = [name for name in names if not panorama and two_circles(read_image(folder / name))]
             found = {name: Equirectangular(*size) for name in names if name not in raw}
             remarks += _about_raw(raw)
         camera_of |= found
@@ -200,7 +204,7 @@ def _about_raw(names: Sequence[str]) -> list[str]:
         return []
     return [
         f"{_were(len(names), 'image')} left out, two fisheye circles side by side and no panorama: {_some(names)}; "
-        "have the camera's own program stitch them."
+        "have the camera's own program stitch them, or give --panorama if they are panoramas."
     ]
 
 

@@ -58,6 +58,7 @@ def make(
     measured: Measured,
     new_images: Path | None,
     *,
+    panorama: bool,
     masks: Masks | None,
     positions: Path | None,
     features: str,
@@ -65,8 +66,8 @@ def make(
     """Make the map, and print the result and what to do next; returns 1 if not all images are in it.
 
     ``cameras`` are those of the calibration file by name, ``video`` a file and a number of frames to take from it into
-    ``folder``, ``positions`` a file of where the images were taken, and ``features`` one of ``MAP_FEATURES``. Raises
-    ``InputError``.
+    ``folder``; with ``panorama``, images of 2 to 1 are panoramas in any case. ``positions`` is a file of where the
+    images were taken, and ``features`` one of ``MAP_FEATURES``. Raises ``InputError``.
     """
     end_without_a_trace()
     how = how_of(features)
@@ -74,7 +75,7 @@ def make(
     with _stages() as tell:
         if video is not None:
             _take_frames(*video, folder, tell)
-        found = photographs(folder, cameras, masks)
+        found = photographs(folder, cameras, masks, panorama)
         if positions is not None:
             measured = Measured(positions=read_positions(positions, found.views))
         for remark in found.remarks:

@@ -295,6 +295,7 @@ def map(
     *,
     camera: OptionalPath = None,
     camera_name: OptionalText = None,
+    panorama: bool = False,
     video: OptionalPath = None,
     frames: int = 40,
     output: OptionalPath = None,
@@ -325,6 +326,7 @@ def map(
         folder: Folder of the photographs, or of a folder for each camera; with --video, where its frames are put.
         camera: Calibration file; without it, those beside the images are taken, and others of 2 to 1 are panoramas.
         camera_name: Which camera of that file all images have; otherwise their name or their folder's says it.
+        panorama: Images of 2 to 1 are panoramas, whatever lies beside them.
         video: Take frames from this video first, the sharpest of each stretch.
         frames: How many frames to take.
         output: Folder of the map; FOLDER_map here if not given.
@@ -344,6 +346,8 @@ def map(
 
     if sum(one is not None for one in (camera_height, distance, positions)) > 1:
         raise InputError("--camera-height, --distance and --positions all give the scale; keep one.")
+    if panorama and camera is not None:
+        raise InputError("--panorama needs no --camera; keep one of them.")
     for flag, metres in (("--camera-height", camera_height), ("--distance", distance and distance[2])):
         if metres is not None and not 0.0 < metres < 1e6:
             raise InputError(f"{flag} is {metres:g}; give a positive number of metres.")
@@ -354,7 +358,18 @@ def map(
     masks = Masks(mask, nadir or 0.0, seam or 0.0) if masked else None
     measured = Measured(camera_height, distance)
     cameras = cameras_of_file(camera, camera_name)
-    return make(folder, output, cameras, taken, measured, localize, masks=masks, positions=positions, features=features)
+    return make(
+        folder,
+        output,
+        cameras,
+        taken,
+        measured,
+        localize,
+        panorama=panorama,
+        masks=masks,
+        positions=positions,
+        features=features,
+    )
 
 
 def sweep(

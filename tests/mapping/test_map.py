@@ -301,6 +301,7 @@ def test_raw_images_of_a_360_degree_camera_are_no_panoramas(tmp_path, rng):
     found = photographs(tmp_path, {})
     assert [view.name for view in found.views] == ["a.png", "b.png"]
     assert "two fisheye circles side by side and no panorama: raw.png" in found.remarks[0]
+    assert len(photographs(tmp_path, {}, panorama=True).views) == 3
 
 
 def test_a_folder_without_photographs_says_what_there_is(tmp_path):
