@@ -308,7 +308,7 @@ def map(
     features: Annotated[str, arg(metavar="sift|aliked")] = "sift",
     localize: OptionalPath = None,
 ) -> int:
-    """Make a map of your own photographs: panoramas, or images of one calibrated wide camera.
+    """Make a map of your own photographs: panoramas, or images of calibrated wide cameras.
 
     Features, matches, COLMAP's structure from motion, which way is down, and scale if you give one; then a scene file
     that opens at once. Needs the extra colmap. Stop it when you like: the same command goes on. Ends with 0 if all
