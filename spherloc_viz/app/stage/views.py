@@ -81,6 +81,8 @@ ROUNDS = 4
 MIN_REACH, REACH = 1000.0, 5.0
 """Distance up to which a page draws: at least the first, viser's own, m; and the second times the distance to the
 target."""
+ROUNDING = 1e-6
+"""Share of half the canvas' height by which a label that was fitted to the edge may seem to be cut."""
 STILL = 1e-3
 """Largest difference of the positions of two equal views, as a share of the distance to the target."""
 MIN_SHARE = 0.5
@@ -171,7 +173,7 @@ def cut(picture: Picture, view: View, aspect: float, letter: float) -> frozenset
     halves = np.array([_half_size(label, letter) for label in labels])
     shown: list[int] = []
     for k in range(len(labels)):
-        inside = np.all(np.abs(seen[k]) + halves[k] <= [aspect, 1.0])
+        inside = np.all(np.abs(seen[k]) + halves[k] <= np.array([aspect, 1.0]) + ROUNDING)
         covers = np.all(np.abs(seen[k] - seen[shown]) < halves[k] + halves[shown], axis=1)
         if inside and not (labels[k].layer in BESIDE and covers.any()):
             shown.append(k)
