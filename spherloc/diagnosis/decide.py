@@ -109,7 +109,7 @@ def with_truth(e: Evidence, t: Truth) -> Cause:
         return Cause.TOO_FEW_INLIERS
     if undetermined(t.rotation_sd_rad, t.position_sd_m):
         return Cause.DEGENERATE
-    if tilts(e, t.tilt_rad, 0.0):
+    if tilts(e, t.exact.tilt_rad, 0.0):
         return Cause.GRAVITY_OFF
     errors = t.fit.errors_px[t.right]
     within, twice = (np.count_nonzero(errors <= factor * e.bound_px) for factor in (1.0, 2.0))
@@ -122,7 +122,7 @@ def with_truth(e: Evidence, t: Truth) -> Cause:
         return Cause.OK
     if missed(e, true):
         return Cause.ITERATIONS_RAN_OUT
-    if t.tilt_rad > e.believed_rad + TILT_RAD:
+    if t.exact.tilt_rad > e.believed_rad + TILT_RAD:
         return Cause.GRAVITY_OFF
     return Cause.DEGENERATE if undetermined(e.rotation_sd_rad, e.position_sd_m) else Cause.UNKNOWN
 

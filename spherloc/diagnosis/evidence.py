@@ -257,10 +257,10 @@ class Truth:
     """Whether the run's pose is right."""
     right: BoolArray
     """(M,) matches that are right."""
+    exact: Fit
+    """The true pose; its tilt is the angle between the given and the true gravity."""
     fit: Fit
     """The true pose, or the fit to the right matches near it if that explains more."""
-    tilt_rad: float
-    """Angle between the given and the true gravity."""
     position_sd_m: float
     """Standard deviation of a position from all right matches."""
     rotation_sd_rad: float
@@ -359,9 +359,9 @@ def gather_truth(trace: Trace, bound_px: float) -> Truth | None:
     free = replace(aligned, gravity_bound_rad=0.0, gravity_sd_rad=np.inf)
     wide = bounds_of(free, WIDER * bound_px)
     near = fit_of(aligned, refine(free, true, wide, replace(options, gravity_sd_deg=np.inf))[0])
-    fit = fit_of(aligned, true)
-    if not different(near.cam_from_map, true) and near.support(bound_px) > fit.support(bound_px):
-        fit = near
+    exact = fit_of(aligned, true)
+    better = not different(near.cam_from_map, true) and near.support(bound_px) > exact.support(bound_px)
+    fit = near if better else exact
     within = WIDER if labels is None else 1.0
     right = fit.errors_px <= within * bound_px if labels is None else labels
     rate = chance_rate(aligned.bearings, bounds_of(free, bound_px).radians)
@@ -373,7 +373,7 @@ def gather_truth(trace: Trace, bound_px: float) -> Truth | None:
     success = evaluate(trace).success
     if success is None:
         success = trace.cam_from_map is not None and not different(aligned.align_pose(trace.cam_from_map), true)
-    return Truth(success, right, fit, fit_of(aligned, true).tilt_rad, position_sd, rotation_sd, within, by_chance)
+    return Truth(success, right, exact, fit, position_sd, rotation_sd, within, by_chance)
 
 
 BANDS, SECTORS = 6, 8

@@ -35,14 +35,25 @@ def describe(
         doubtful=cause is not Cause.OK,
         summary=_summary(e, truth, cause, other, trace.problem.unit),
         evidence=tuple(_sentences(trace, e, truth, certificate)),
-        advice=_advice(trace, e, cause),
+        advice=_advice(trace, e, truth, cause),
         used_truth=truth is not None,
         alternative_cam_from_map=None if other is None else e.aligned.unalign_pose(other.cam_from_map),
     )
 
 
-def _advice(trace: Trace, e: Evidence, cause: Cause) -> str:
+FAR = 3.0
+"""Number of noise bounds beyond which the errors of most right matches are not noise."""
+
+
+def _advice(trace: Trace, e: Evidence, truth: Truth | None, cause: Cause) -> str:
     """What to do; never what the run has done already."""
+    if cause is Cause.BOUND_TOO_SMALL and truth is not None:
+        off_px = float(np.median(truth.exact.errors_px[truth.right]))
+        if off_px > FAR * e.bound_px:
+            return (
+                f"Calibrate better: half of the right matches are {off_px:.0f} px off or more at the true pose, and a "
+                "bound as wide lets wrong ones in."
+            )
     if cause is Cause.GRAVITY_OFF and e.believed_rad < e.aligned.gravity_bound_rad:
         return "Set gravity_sd_deg to what the problem states, or leave it out; then the refinement corrects the tilt."
     if cause is Cause.SEARCH_MISSED and trace.stage(ConsensusStage) is not None:
@@ -110,7 +121,7 @@ def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause, unit: str)
     if fit is None:
         raise ValueError(f"{cause} was found without a pose to show it")
     if cause is Cause.GRAVITY_OFF:
-        tilt_rad = fit.tilt_rad if truth is None else truth.tilt_rad
+        tilt_rad = fit.tilt_rad if truth is None else truth.exact.tilt_rad
         bound_rad = e.aligned.gravity_bound_rad
         if e.believed_rad < bound_rad:
             believed = f"allows for {_deg(e.believed_rad)} at most" if e.believed_rad else "keeps it as it is"
@@ -118,7 +129,11 @@ def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause, unit: str)
         return f"The known gravity is off by {_deg(tilt_rad)}, but its bound is {_deg(bound_rad)}."
     errors = fit.errors_px if truth is None else fit.errors_px[truth.right]
     one, two = (int(np.count_nonzero(errors <= factor * e.bound_px)) for factor in (1, 2))
-    return f"The noise exceeds the bound: {one} matches are within its {e.bound_px:.3g} px, {two} within twice as much."
+    where = "" if truth is None else "at the true pose, " if fit is truth.exact else "near the true pose, "
+    return (
+        f"The noise exceeds the bound: {where}{one} matches are within its {e.bound_px:.3g} px, {two} within twice as "
+        "much."
+    )
 
 
 def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Certificate | None) -> Iterator[str]:
@@ -145,7 +160,7 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
     if e.free is not None and np.isfinite(e.free_tilt_sd_rad):
         one, two, four = (e.free.support(factor * bound) for factor in (1, 2, 4))
         yield (
-            f"Where gravity is not believed, {one} agree within the bound, {two} within twice and {four} within "
+            f"With a pose fitted without gravity, {one} agree within the bound, {two} within twice and {four} within "
             f"four times of it; gravity then tilts by {_deg(e.free.tilt_rad)}, "
             f"give or take {_deg(e.free_tilt_sd_rad)}, and its bound is {_deg(e.aligned.gravity_bound_rad)}."
         )
@@ -157,7 +172,8 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
 def _proofs(trace: Trace, certificate: Certificate | None) -> Iterator[str]:
     if (ransac := trace.stage(RansacStage)) is not None:
         reached = 100.0 * ransac.confidence_reached
-        yield f"RANSAC drew {ransac.iterations:,} samples and reached a confidence of {reached:.3g} % (Eq. 28)."
+        drew = f"RANSAC drew {ransac.iterations:,} samples"
+        yield f"{drew}, a confidence of {reached:.3g} % (Eq. 28) if no more matches are right than it found."
     if certificate is not None and certificate.proven:
         most = certificate.upper_bound
         yield f"Proven: no pose within the gravity bound explains more than {most}, and one explains as many."
@@ -170,10 +186,12 @@ def _proofs(trace: Trace, certificate: Certificate | None) -> Iterator[str]:
 
 def _truths(trace: Trace, e: Evidence, truth: Truth) -> Iterator[str]:
     right, metrics = int(np.count_nonzero(truth.right)), evaluate(trace)
-    yield f"Truth: {right} matches are right, and {truth.fit.support(e.bound_px)} agree with the true pose."
+    at, near = truth.exact.support(e.bound_px), truth.fit.support(e.bound_px)
+    more = f", {near} with a pose fitted near it" if near > at else ""
+    yield f"Truth: {right} matches are right, and {at} agree with the true pose{more}."
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         error = f"{metrics.translation_error_m:.3g} {trace.problem.unit} and {metrics.rotation_error_deg:.3g}°"
-        yield f"Truth: the run's pose is off by {error}; the known gravity by {_deg(truth.tilt_rad)}."
+        yield f"Truth: the run's pose is off by {error}; the known gravity by {_deg(truth.exact.tilt_rad)}."
 
 
 def _deg(angle_rad: float) -> str:

@@ -71,8 +71,11 @@ def _how_far(poses: Poses, residual: tuple[float, float]) -> str:
 def _why_kept(trace: Trace, poses: Poses) -> str:
     if poses.right is None:
         return ""
-    if poses.right:
-        return "The truth calls it an inlier too."
+    if poses.right and poses.truth is None:
+        return "Its label says that it is right."
+    if poses.right and poses.truth is not None:
+        beyond = poses.truth[0] > poses.bound_px
+        return f"It is a right match, {'but ' if beyond else ''}{_off(poses.truth)} at the true pose."
     if poses.truth is None:
         return "But its label says that it is wrong."
     if poses.truth[0] <= poses.bound_px:
