@@ -19,7 +19,7 @@ from spherloc_viz.app.left_panels import LeftPanels
 from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.stage.canvas import Canvas
-from spherloc_viz.app.text import diagnosis_html, hidden_html, status_html
+from spherloc_viz.app.text import diagnosis_html, hidden_html, status_html, summary_of
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import changes_of, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
@@ -199,12 +199,14 @@ class RunDisplay:
             return None
         (run, mesh, picture), display = self._shown, self.controls.display
         trace, layers = run.trace, display.layers()
+        words, facts = summary_of(trace)
+        outcome = "" if self.withheld(run) else f" · {words.capitalize()} · {' · '.join(facts)}"
         return Shown(
             trace=trace,
             items=tuple(item for item in picture.scene if item.layer in layers),
             backdrop=mesh if "mesh" in layers else None,
             title=run.request.scene.scene,
-            note=f"{trace.estimator}, seed {trace.seed}.{'' if self.withheld(run) else f' {trace.message}'}",
+            note=f"{trace.estimator}, seed {trace.seed}{outcome}",
             recorded=recorded,
             dark=display.theme == "dark",
         )

@@ -104,10 +104,9 @@ def opening_card_html(label: str, words: str, share: float) -> str:
     return f'<div hidden data-opening="{escape(json.dumps(told))}"></div>'
 
 
-def summary_html(trace: Trace) -> str:
-    """A run in one line: verdict, errors, inliers and time."""
+def summary_of(trace: Trace) -> tuple[str, list[str]]:
+    """A run's verdict, and its errors, inliers and time."""
     metrics = evaluate(trace)
-    words = verdict(trace, metrics.success)
     inliers = int(np.count_nonzero(trace.inlier_mask))
     facts = [f"{inliers} of {len(trace.problem)} inliers", duration_text(trace.timings_ms["total"])]
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
@@ -116,6 +115,12 @@ def summary_html(trace: Trace) -> str:
             length(metrics.translation_error_m, trace.problem.metric),
             *facts,
         ]
+    return verdict(trace, metrics.success), facts
+
+
+def summary_html(trace: Trace) -> str:
+    """A run in one line."""
+    words, facts = summary_of(trace)
     line = f'<b style="{_value_css(words)}">{escape(words.capitalize())}</b> · ' + " · ".join(map(escape, facts))
     return box(line, "font-size:12.5px;padding-top:.2em")
 
