@@ -57,7 +57,8 @@ RECIPES = (
     ),
     _Recipe(
         "RANSAC bad luck",
-        "The same with RANSAC and 100 samples, none of which is a pair of right matches: take another seed or 1000.",
+        "90 % of the matches are wrong, and none of RANSAC's 100 samples is a pair of right ones: take another seed or "
+        "1000 samples.",
         "mei_outliers_90",
         2,
         estimator="ransac-2p",

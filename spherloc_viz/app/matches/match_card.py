@@ -237,7 +237,8 @@ def _notes(what: Explanation, kept: NDArray) -> str:
     if what.right is not None and what.labelled:
         notes.append(f"Its label says {'inlier' if what.right else 'outlier'}.")
     if what.silent:
-        notes.append(f"{what.silent:,} pairs are too close to say anything, and count as agreeing.")
+        many = f"{what.silent:,} pairs are too close to say anything, and count as agreeing."
+        notes.append(many if what.silent > 1 else "One pair is too close to say anything, and counts as agreeing.")
     notes = [escape(note) for note in notes]
     if what.at_truth is not None:
         notes.append(_excluding(what.number, what.at_truth, kept))
@@ -262,7 +263,9 @@ def _bounds(what: Explanation) -> str:
 
 
 def _excluding(number: int, pairs: Pairs, kept: NDArray) -> str:
-    words = f"{pairs.excluded:,} pairs exclude the true yaw, and {pairs.impossible:,} agree at none."
+    excluding = "One pair excludes" if pairs.excluded == 1 else f"{pairs.excluded:,} pairs exclude"
+    agreeing = "one agrees" if pairs.impossible == 1 else f"{pairs.impossible:,} agree"
+    words = f"{excluding} the true yaw, and {agreeing} at none."
     if not pairs.worst:
         return words
     worst = ", ".join(
