@@ -294,15 +294,19 @@ def first_pose(
 def _another(
     aligned: AlignedProblem, bounds: Bounds, matches: PackedMatches, guess: TwoPointSearch
 ) -> tuple[FloatArray, int] | None:
-    """The best of the robust fits to 2P poses of pairs that the guess explains, where gravity is uncertain: a pose
-    (3, 4) within the gravity bound, and what it explains."""
-    most = min(MAX_PAIR_STARTS, PAIR_STARTS_EFFORT // len(aligned.points))
+    """Where gravity is uncertain, the best of the robust fits to 2P poses of all pairs or, if these are many, of pairs
+    that the guess explains: a pose (3, 4) within the gravity bound, and what it explains."""
+    size = len(aligned.points)
+    most = min(MAX_PAIR_STARTS, PAIR_STARTS_EFFORT // size)
     if aligned.gravity_bound_rad == 0.0 or not guess.found or most == 0:
         return None
-    ((yaw, translation),) = _poses(guess)
-    members = np.flatnonzero(residuals_px(aligned, pose(yaw_rotation(yaw), translation)) <= bounds.pixels)
-    pairs = np.random.default_rng(0).choice(members, (most, 2))
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    if size * (size - 1) // 2 <= most:
+        pairs = np.column_stack(np.triu_indices(size, 1))
+    else:
+        ((yaw, translation),) = _poses(guess)
+        members = np.flatnonzero(residuals_px(aligned, pose(yaw_rotation(yaw), translation)) <= bounds.pixels)
+        pairs = np.random.default_rng(0).choice(members, (most, 2))
+        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     yaws, translations, exists = two_point(aligned.bearings[pairs], aligned.points[pairs])
     best = None
     for level in level_poses(yaws[exists], translations[exists]):
