@@ -1,5 +1,6 @@
 """The photographs from which a map is made: a folder's images with their cameras, or the sharpest frames of a video."""
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
@@ -162,7 +163,7 @@ def _with_cameras(
         return dict.fromkeys(names, next(iter(fitting.values()))), []
     found = {}
     for name in names:
-        called = [camera for camera in fitting if _plain(camera) in _plain(name)]
+        called = [camera for camera in fitting if _is_in(camera, name)]
         if called:
             found[name] = fitting[max(called, key=len)]
     if found:
@@ -173,8 +174,14 @@ def _with_cameras(
     return dict.fromkeys(names, fitting[first]), [f"{taken}, but {_some(others)} would fit, too; {choice}."]
 
 
-def _plain(name: str) -> str:
-    return name.lower().replace("_", "-")
+def _is_in(camera: str, image: str) -> bool:
+    """Whether the name of a camera is a part of an image's name; COLMAP's numbers of cameras are not looked for there,
+    where a digit may mean anything."""
+    if not camera or camera.isdigit():
+        return False
+    plain, word = (name.lower().replace("_", "-") for name in (image, camera))
+    after = "0-9" if word[-1].isdigit() else "a-z"
+    return re.search(f"(?<![a-z0-9]){re.escape(word)}(?![{after}])", plain) is not None
 
 
 def _beside(root: Path, inside: str) -> dict[str, Camera]:

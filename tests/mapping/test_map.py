@@ -19,7 +19,7 @@ from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.make import Measured, make_map, scale_of
-from spherloc.mapping.photographs import frames_of, photographs, two_circles
+from spherloc.mapping.photographs import _is_in, frames_of, photographs, two_circles
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
 from spherloc.problem import Problem
 from spherloc_viz.commands.map import _kind, main, map_report
@@ -164,6 +164,10 @@ def test_each_image_of_a_rig_has_its_camera(tmp_path, rng):
     flat.mkdir()
     for name in ("camera-slam-left_1.png", "camera-slam-right_1.png", "else.png"):
         picture(flat / name, 400, 300, rng)
+    # A number may be that of a picture, and cam1 is not cam10.
+    numbers = photographs(flat, {"1": lens, "2": other})
+    assert {view.camera.fx for view in numbers.views} == {90.0} and "Camera 1 is taken" in numbers.remarks[0]
+    assert not _is_in("cam1", "cam10_1.png") and _is_in("left", "left0001.png") and not _is_in("left", "leftover.png")
     picture(flat / "panorama.png", 400, 200, rng)
     (flat / "slam_left.toml").write_text(written(lens))
     (flat / "slam_right.toml").write_text(written(other))
