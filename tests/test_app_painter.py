@@ -13,10 +13,11 @@ import trimesh
 import viser
 
 from spherloc_viz import style
-from spherloc_viz.app.stage.painter import MAX_BATCHED, SHELLS, Painter
+from spherloc_viz.app.stage.painter import LARGEST_DOT, LARGEST_DOT_INSIDE, MAX_BATCHED, SHELLS, Painter
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Textured
+from spherloc_viz.layers.selection import HALO
 
 ALL = frozenset(style.LAYERS)
 
@@ -203,6 +204,25 @@ def test_a_rim_shows_its_back_only(painter: Painter, canvas: Canvas) -> None:
     for name, rim in (("halo", True), ("dot", False)):
         painter.draw([Points(name, "map", np.zeros((1, 3)), one_color(style.SELECTED, 1), 0.1, rim=rim)], ALL)
     assert [canvas.calls[name][1]["side"] for name in ("/halo", "/dot")] == ["back", "front"]
+
+
+def test_a_dot_before_the_viewer_is_small_on_the_screen(painter: Painter, canvas: Canvas) -> None:
+    near, far = np.array([0.0, 0.0, 2.0]), np.array([0.0, 0.0, 50.0])
+    colors = one_color(style.SELECTED, 2)
+    items = [Points(name, "map", np.stack([near, far]), colors, 0.1, rim=name == "rim") for name in ("dot", "rim")]
+    painter.see_from(np.zeros(3), in_camera=False)
+    painter.draw(items, ALL)
+    assert np.allclose(canvas.nodes["/dot"].batched_scales, [2.0 * LARGEST_DOT, 0.1])
+    assert np.allclose(canvas.nodes["/rim"].batched_scales, [2.0 * LARGEST_DOT * HALO, 0.1]), "still around its dot"
+    assert painter.resizes(np.zeros(3), in_camera=True)
+    painter.see_from(np.zeros(3), in_camera=True)
+    assert np.allclose(canvas.nodes["/dot"].batched_scales, [2.0 * LARGEST_DOT_INSIDE, 0.1])
+    assert not painter.resizes(0.02 * near, in_camera=True), "a small step changes nothing"
+    moved = Points("dot", "map", np.stack([far, near]), colors, 0.1)
+    painter.draw([moved], ALL)
+    assert np.allclose(canvas.nodes["/dot"].batched_scales, [0.1, 2.0 * LARGEST_DOT_INSIDE]), "the dots moved"
+    painter.see_from(100.0 * near, in_camera=False)
+    assert np.allclose(canvas.nodes["/dot"].batched_scales, 0.1), "from far away they have their own size"
 
 
 def test_nothing_is_sent_for_what_stays(server: viser.ViserServer, painter: Painter, canvas: Canvas) -> None:

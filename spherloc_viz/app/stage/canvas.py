@@ -149,12 +149,12 @@ class Canvas:
         if picture is None:
             return
         in_the_way = views.before_the_eyes(picture, position) | self._cut(picture, position)
-        eye = position if views.inside(picture, position) else None
+        in_camera = views.inside(picture, position)
         # Does not wait, since the viewer moves often, for a picture that is being drawn.
-        if in_the_way != self._painter.hidden or (eye is None) != (self._painter.eye is None):
+        if in_the_way != self._painter.hidden or self._painter.resizes(position, in_camera):
             with self._lock:
                 self._painter.hide(in_the_way)
-                self._painter.see_from(eye)
+                self._painter.see_from(position, in_camera)
 
     def _cut(self, picture: Picture, position: np.ndarray) -> frozenset[str]:
         """Names of the labels that the canvas' edge would cut for a viewer at that position (3,)."""
@@ -245,6 +245,8 @@ class Canvas:
         if name is None:
             self._followed = view
         self._looked, self._taken_s = (name, view, aspect), time.monotonic()
+        picture = self._picture
+        self._painter.see_from(view.position, picture is not None and views.inside(picture, view.position))
         views.look(self._client, view)
 
     def _untouched(self) -> bool:

@@ -19,6 +19,7 @@ from spherloc_viz.app.stage.picking import inside, nearest, viewer_of
 from spherloc_viz.app.web.viser_internals import update_node
 from spherloc_viz.layers.frame import icosphere, one_color
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, SceneItem, Segments, Textured
+from spherloc_viz.layers.selection import HALO
 
 # three.js, ACESFilmicToneMapping: matrix, rational curve (v^2 + A v - B) / (C v^2 + D v + E), matrix, at exposure 1.
 _INTO = np.array([[0.59719, 0.35458, 0.04823], [0.07600, 0.90834, 0.01566], [0.02840, 0.13383, 0.83777]])
@@ -92,8 +93,11 @@ MAX_ROUND = 400
 """If there are more dots, they have fewer faces."""
 MAX_BATCHED = 3000
 """If there are more dots, they are drawn as a point cloud, which costs less."""
-LARGEST_DOT = 0.007
-"""Largest radius of a dot as a share of its distance, for a viewer inside a camera."""
+LARGEST_DOT, LARGEST_DOT_INSIDE = 0.012, 0.007
+"""Largest radius of a dot as a share of its distance, and the same for a viewer inside a camera, since dots would hide
+the photograph."""
+RESIZED = 0.2
+"""Relative change of a dot's radius from which on it is drawn anew."""
 LABEL_SCALE = 0.9
 """Size of labels, relative to viser's own."""
 PLACE = frozenset({"wxyz", "position"})
@@ -120,8 +124,10 @@ class Painter:
         self._names: frozenset[str] = frozenset()
         self.hidden: frozenset[str] = frozenset()
         """Names of nodes that are not shown."""
-        self.eye: np.ndarray | None = None
-        """Position (3,) of a viewer inside a camera."""
+        self._seen_from: tuple[np.ndarray, bool] | None = None
+        """Position (3,) of the viewer and whether it is inside a camera; None while dots of any size are good."""
+        self._dots: tuple[tuple[Any, Points], ...] = ()
+        """Nodes of dots, and what they show."""
         self.dark = True
         """Whether the background is dark."""
         self.clicked_x = 0.5
@@ -150,6 +156,9 @@ class Painter:
                     self._put(part, look)
                     names.add(part.name)
             self._names = frozenset(name for name in names if self._drawn[name][2].layer in layers)
+            drawn = [(handle, item) for handle, _, item in self._drawn.values()]
+            self._dots = tuple((handle, item) for handle, item in drawn if isinstance(item, Points) and _round(item))
+            self._limit_dots()
             self._follow()
         self._shown = tuple(shown)
 
@@ -160,21 +169,20 @@ class Painter:
             with self._client.atomic():
                 self._follow()
 
-    def see_from(self, eye: np.ndarray | None) -> None:
-        """Limit dots to ``LARGEST_DOT`` for a viewer inside a camera, at ``eye`` (3,), since they would hide the
-        photograph. None is for a viewer outside."""
-        if (eye is None) != (self.eye is None):
-            self.eye = eye
-            with self._client.atomic():
-                for handle, _, item in self._drawn.values():
-                    if isinstance(item, Points) and len(item.positions) <= MAX_BATCHED:
-                        update_node(handle, batched_scales=np.float32(self._dot_radii_m(item)))
+    def resizes(self, eye: np.ndarray, in_camera: bool) -> bool:
+        """Whether ``see_from`` would change the size of a dot; needs no lock."""
+        return any(_resized(handle, item, (eye, in_camera)) for handle, item in self._dots)
 
-    def _dot_radii_m(self, item: Points) -> np.ndarray:
-        radii_m = np.full(len(item.positions), item.radius_m)
-        if self.eye is None:
-            return radii_m
-        return np.minimum(radii_m, LARGEST_DOT * np.linalg.norm(item.positions - self.eye, axis=1))
+    def see_from(self, eye: np.ndarray, in_camera: bool) -> None:
+        """Limit the size of dots on the screen for a viewer at ``eye`` (3,), who may be inside a camera."""
+        self._seen_from = eye, in_camera
+        with self._client.atomic():
+            self._limit_dots()
+
+    def _limit_dots(self) -> None:
+        for handle, item in self._dots:
+            if self._seen_from is not None and _resized(handle, item, self._seen_from):
+                update_node(handle, batched_scales=np.float32(_dot_radii_m(item, *self._seen_from)))
 
     def _follow(self) -> None:
         """Set which nodes are visible."""
@@ -207,8 +215,6 @@ class Painter:
             handle = _add(self._client.scene, item, glb, self._label_scale)
         elif not _same(item, last):
             changing = _changing(item)
-            if isinstance(item, Points) and "batched_scales" in changing:
-                changing["batched_scales"] = np.float32(self._dot_radii_m(item))
             update_node(handle, **{name: value for name, value in changing.items() if name not in PLACE})
             for name in PLACE & changing.keys():
                 setattr(handle, name, changing[name])
@@ -305,7 +311,7 @@ _SHOWN: dict[type[SceneItem], tuple[str, ...]] = {
 def _changing(item: SceneItem) -> dict[str, Any]:
     """The properties of a node that follow the item."""
     match item:
-        case Points() if len(item.positions) > MAX_BATCHED:
+        case Points() if not _round(item):
             return {"points": np.float32(item.positions), "colors": item.colors, "point_size": 2.0 * item.radius_m}
         case Points():
             return _instances(item.positions, np.full(len(item.positions), item.radius_m), item.colors)
@@ -324,6 +330,23 @@ def _changing(item: SceneItem) -> dict[str, Any]:
         case Label():
             height = {} if item.height_m is None else {"font_scene_height": item.height_m}
             return {"text": item.text, "position": item.position, **height}
+
+
+def _round(item: Points) -> bool:
+    """Whether dots are drawn as spheres, and not as a point cloud."""
+    return len(item.positions) <= MAX_BATCHED
+
+
+def _dot_radii_m(item: Points, eye: np.ndarray, in_camera: bool) -> np.ndarray:
+    """Radii (K,) of dots for a viewer at ``eye`` (3,), who may be inside a camera."""
+    largest = (LARGEST_DOT_INSIDE if in_camera else LARGEST_DOT) * (HALO if item.rim else 1.0)
+    return np.minimum(item.radius_m, largest * np.linalg.norm(item.positions - eye, axis=1))
+
+
+def _resized(handle: Any, item: Points, seen_from: tuple[np.ndarray, bool]) -> bool:
+    """Whether a node of dots has to change for a viewer there."""
+    wanted, now = _dot_radii_m(item, *seen_from), handle.batched_scales
+    return bool(np.any(np.abs(wanted - now) > RESIZED * now))
 
 
 def _instances(positions: np.ndarray, radii_m: np.ndarray, colors: np.ndarray) -> dict[str, Any]:

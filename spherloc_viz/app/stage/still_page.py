@@ -84,6 +84,7 @@ def scene_script(still: Still) -> str:
             server.gui.configure_theme(dark_mode=still.dark, show_logo=False, show_share_button=False)
             painter = Painter(server)
             painter.dark = still.dark
+            painter.see_from(np.asarray(still.position), in_camera=False)
             painter.draw(still.items, layers)
             painter.draw_backdrop(still.backdrop, still.aligned_from_map, True)
             data = base64.b64encode(server.get_scene_serializer().serialize()).decode()
