@@ -153,6 +153,26 @@ def test_what_cannot_be_opened_is_said_and_nothing_more(visitor: Visitor, words:
     assert "open-scene:1:mei_outliers_80.toml" in visitor.rows, "the list is still there"
 
 
+def test_folders_of_cameras_are_offered_as_one_map_unless_a_link_leads_out(visitor: Visitor, folder: Path) -> None:
+    for name in ("left/0.png", "left/1.png", "right/0.png", "right/1.png"):
+        (folder / "rig" / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / "rig" / name).touch()
+    visitor.touch("open-folder:0:0:rig")
+    assert "map-folder:0:rig" in visitor.rows
+    assert "Make a map of the 4 photographs in the folders left and right" in visitor.panel._list.content
+    visitor.touch("open-folder:0:0:rig/left")
+    assert "Make a map of these 2 photographs" in visitor.panel._list.content
+
+    (folder.parent / "private").mkdir()
+    (folder.parent / "private" / "0.png").touch()
+    (folder / "rig" / "third").symlink_to(folder.parent / "private")
+    visitor.touch("open-folder:0:0:rig")
+    assert "map-folder:0:rig" not in visitor.rows
+    for place in ("0:rig", "0:sub"):
+        visitor.touch(f"map-folder:{place}")
+        assert "not a folder of photographs" in visitor.said and visitor.panel._map._process is None
+
+
 def test_names_of_files_are_escaped(visitor: Visitor) -> None:
     visitor.touch("open-folder:0:0:")
     assert "<img" not in visitor.panel._list.content and f"open-scene:0:{EVIL}" in visitor.rows

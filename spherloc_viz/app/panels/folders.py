@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from spherloc.datasets.given_path import images_in_folders
 from spherloc.datasets.scene_file import read_table
 from spherloc.errors import InputError
 from spherloc.files import IMAGES
@@ -50,7 +51,10 @@ class Listing:
     remarks: tuple[str, ...]
     """What is not shown and why, in sentences."""
     photographs: int
-    """Image files in it."""
+    """Number of image files in it."""
+    in_folders: dict[str, int]
+    """Number of image files in each of its sub-folders that has some; empty if it has image files itself, or if a link
+    in it leads out of the allowed folders."""
 
 
 class Roots:
@@ -94,7 +98,7 @@ class Roots:
         """
         folder = self.find(place)
         try:
-            entries, remarks, photographs = self._entries(folder)
+            entries, remarks, photographs, outside = self._entries(folder)
         except OSError as error:
             reason = error.strerror or error
             raise InputError(f"the folder {folder.name} cannot be read ({reason}); choose another.") from None
@@ -102,10 +106,13 @@ class Roots:
         page = min(max(page, 0), pages - 1)
         rows = tuple(describe(path, own) for path, own in entries[PAGE * page : PAGE * (page + 1)])
         above = self.place(folder.parent)
-        return Listing(folder, self.place(folder) or "", above, rows, page, pages, remarks, photographs)
+        folders = [] if photographs or outside else [path.name for path, _ in entries if path.is_dir()]
+        counts = images_in_folders(folder, folders)
+        return Listing(folder, self.place(folder) or "", above, rows, page, pages, remarks, photographs, counts)
 
-    def _entries(self, folder: Path) -> tuple[list[tuple[Path, str]], tuple[str, ...], int]:
-        """Folders, then TOML files, by name, each with its place; what was left out; and how many are images."""
+    def _entries(self, folder: Path) -> tuple[list[tuple[Path, str]], tuple[str, ...], int, int]:
+        """Folders, then TOML files, by name, each with its place; what was left out; how many are images; and how many
+        lead out of the roots."""
         found: list[tuple[bool, str, Path, str]] = []
         hidden = outside = photographs = 0
         whole = True
@@ -129,7 +136,7 @@ class Roots:
                     found.append((not is_folder, entry.name, folder / entry.name, place))
         found.sort(key=lambda item: (item[0], item[1].casefold(), item[1]))
         remarks = tuple(_remarks(hidden, outside, whole))
-        return [(path, place) for _, _, path, place in found], remarks, photographs
+        return [(path, place) for _, _, path, place in found], remarks, photographs, outside
 
 
 def _remarks(hidden: int, outside: int, whole: bool) -> Iterator[str]:

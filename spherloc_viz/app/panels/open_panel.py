@@ -22,9 +22,11 @@ from spherloc_viz.app.web.viser_internals import limit_uploads, update_widget
 from spherloc_viz.app.workers import BackgroundWorker
 
 MAP_ABOUT = (
-    "Panoramas twice as wide as high, or images of one camera with its calibration beside them. It takes some minutes, "
-    "and opens when it is done."
+    "Panoramas twice as wide as high, or images with the calibrations of their cameras beside them. It takes some "
+    "minutes, and opens when it is done."
 )
+MAX_NAMED = 3
+"""Largest number of folders, besides the last, that are named."""
 RULE = "border-top:1px solid rgba(128,140,160,.22)"
 
 
@@ -49,8 +51,7 @@ def _folder_html(listing: Listing) -> str:
     """Folder by folder; first the way up, last the other pages."""
     above = "open-folder:" if listing.parent is None else f"open-folder:0:{listing.parent}"
     rows = [_row_html(above, "↑ up" if listing.parent else "↑ all folders", "")]
-    if listing.photographs >= MIN_IMAGES:
-        title = f"Make a map of these {listing.photographs:,} photographs"
+    if title := _map_title(listing):
         rows.append(_row_html(f"map-folder:{listing.place}", title, MAP_ABOUT))
     for row in listing.rows:
         if row.kind == "folder":
@@ -68,6 +69,20 @@ def _folder_html(listing: Listing) -> str:
         pages = f'<div style="padding:.3em 0">page {listing.page + 1} of {listing.pages} {" ".join(links)}</div>'
     remarks = "".join(f'<div style="font-size:12px;{DIM}">{escape(words)}</div>' for words in listing.remarks)
     return _section(f"{listing.folder.name}/", rows) + pages + remarks
+
+
+def _map_title(listing: Listing) -> str:
+    """What map could be made here; empty for none."""
+    if listing.photographs >= MIN_IMAGES:
+        return f"Make a map of these {listing.photographs:,} photographs"
+    inside = sum(listing.in_folders.values())
+    if inside < MIN_IMAGES:
+        return ""
+    *others, last = sorted(listing.in_folders)
+    folders = f"the folders {', '.join(others)} and {last}" if others else f"the folder {last}"
+    if len(others) > MAX_NAMED:
+        folders = f"{len(others) + 1} folders"
+    return f"Make a map of the {inside:,} photographs in {folders}"
 
 
 def _link(action: str, words: str) -> str:
@@ -184,8 +199,10 @@ class OpenPanel:
 
     def _build_form(self, gui: viser.GuiApi) -> None:
         about = (
-            "A CSV whose first line names u, v (px), X, Y, Z (m) and maybe inlier (0 or 1). "
-            "Only this page has it, and it is removed when the page is closed."
+            "A CSV whose first line names u, v (px), X, Y, Z (m) and maybe inlier (0 or 1). Only this page has it, and "
+            "it is removed when the page is closed. Gravity is a vector that points down; in the camera +x is right, "
+            "+y down, +z forward. The true pose, which may be left empty, is twelve numbers: the rows of [R | t], "
+            "camera from map."
         )
         gui.add_html(box(f'<div style="{DIM}">{escape(about)}</div>', "font-size:12px"))
         matches = gui.add_upload_button("Matches (CSV)", mime_type=".csv,text/csv,text/plain")
@@ -193,15 +210,12 @@ class OpenPanel:
             "Calibration", hint="KITTI-360, Kalibr, stella or 360Loc YAML, Basalt JSON, or TOML with [camera]."
         )
         self._pasted = gui.add_text("or paste [camera]", "", multiline=True, hint="TOML; goes before an uploaded one.")
-        down = "Unit vector that points down."
         self._gravity = (
-            gui.add_text("Gravity, camera", "0 1 0", hint=f"{down} +x is right, +y down, +z forward."),
-            gui.add_text("Gravity, map", "0 0 -1", hint=down),
+            gui.add_text("Gravity, camera", "0 1 0", hint="Points down, in the camera frame."),
+            gui.add_text("Gravity, map", "0 0 -1", hint="Points down, in the map frame."),
             gui.add_text("Gravity bound (deg)", "", hint="How far the camera's may be off; empty for 0."),
         )
-        self._truth = gui.add_text(
-            "True pose", "", hint="Twelve numbers: the rows of [R | t], camera from map; optional."
-        )
+        self._truth = gui.add_text("True pose", "", hint="Shows how far the estimate is off.")
         self._fields = (self._pasted, *self._gravity, self._truth)
         self._files_text = gui.add_html("", visible=False)
         go = gui.add_button("Open upload")
@@ -240,8 +254,8 @@ class OpenPanel:
     def _make_map(self, place: str) -> None:
         """Make a map: beside the folder, as the command does, or inside it if pages may not write beside it."""
         folder = self._roots.find(place)
-        if not folder.is_dir():
-            raise InputError("this is not a folder; choose one from the list.")
+        if not folder.is_dir() or not _map_title(self._roots.look_into(place)):
+            raise InputError("this is not a folder of photographs; choose one from the list.")
         above = folder if self._roots.place(folder.parent) is None else folder.parent
         self._map.start(folder, above / f"{folder.name}{OUTPUT}")
 
