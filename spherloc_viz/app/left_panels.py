@@ -137,8 +137,8 @@ class LeftPanels:
         self._opening = label
         self._changed(None)
 
-    def tell_opening(self, words: str, share: float) -> None:
-        """Show the progress of the opening, 0 to 1."""
+    def tell_opening(self, words: str, share: float | None) -> None:
+        """Show the progress of the opening, 0 to 1, or None where it is not known."""
         if self._opening:
             self._card.content = opening_card_html(self._opening, words, share)
 

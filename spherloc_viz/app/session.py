@@ -221,7 +221,7 @@ class Session:
         if self._run is None:
             panels = self._display.panels
             panels.begin_opening(self._controls.scene.read().scene)
-            panels.tell_opening(sentence, 0.0)
+            panels.tell_opening(sentence, None)
 
     def _move_camera(self, true_camera: TrueCamera) -> None:
         self._controls.scene.true_camera = true_camera

@@ -98,9 +98,10 @@ def opening_html(label: str) -> str:
     return box(words, "font-size:12.5px;padding-top:.2em")
 
 
-def opening_card_html(label: str, words: str, share: float) -> str:
-    """Has the page's script (``opening.js``) show over the canvas how far the opening of a scene is, 0 to 1."""
-    told = {"title": f"Opening {label} …", "words": words, "share": round(share, 3)}
+def opening_card_html(label: str, words: str, share: float | None) -> str:
+    """Has the page's script (``opening.js``) show over the canvas how far the opening of a scene is, 0 to 1, or None
+    where that is not known."""
+    told = {"title": f"Opening {label} …", "words": words, "share": None if share is None else round(share, 3)}
     return f'<div hidden data-opening="{escape(json.dumps(told))}"></div>'
 
 

@@ -319,7 +319,8 @@ def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
     ):
         out.append(Plan(key, title, partial(draw, view, balls), graph=partial(_greedy_graph, balls, graph, order)))
     for size in growing(len(stage.clique), *CLIQUE_SIZES):
-        title, draw = f"{size} balls of the maximum clique", partial(_members, view, balls, size)
+        title = f"{size} of the {len(stage.clique):,} balls of the maximum clique"
+        draw = partial(_members, view, balls, size)
         words = f"{size} of the {len(stage.clique):,} nodes of the maximum clique."
         out.append(Plan(f"clique-{size}", title, draw, graph=partial(graph, None, balls.members[:size], words)))
     words = f"The maximum clique: {len(stage.clique):,} nodes that all agree, a full block of the matrix."

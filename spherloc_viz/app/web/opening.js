@@ -40,6 +40,7 @@
       if (now !== told) {
         card.querySelector(".title").textContent = title;
         card.querySelector(".words").textContent = words;
+        card.querySelector(".bar").hidden = share === null;
         card.querySelector(".bar > div").style.width = `${100 * share}%`;
       }
       place();
