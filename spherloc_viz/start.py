@@ -5,6 +5,8 @@ import signal
 import sys
 from collections.abc import Mapping, Sequence
 
+from spherloc_viz.importing import importing
+
 
 def main() -> None:
     """Entry point of ``spherloc``.
@@ -20,7 +22,8 @@ def main() -> None:
     if heard is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
-        from spherloc_viz.commands import cli
+        with importing():
+            from spherloc_viz.commands import cli
     except OSError as error:  # no folder for temporary files
         why = f"cannot start ({error.strerror}); make room on the disk, or set TMPDIR to another folder."
         print(f"spherloc: {why}", file=sys.stderr)

@@ -30,6 +30,7 @@ def compiler(monkeypatch: pytest.MonkeyPatch) -> Compiler:
     made = Compiler()
     monkeypatch.setattr(compilation, "compile_apart", made.compile)
     monkeypatch.setattr(compilation, "warm_up", lambda estimators: None)
+    monkeypatch.setattr(compilation, "FIRST_PAGE_S", 0.0)
     return made
 
 
@@ -41,6 +42,33 @@ def running(compiler: Compiler) -> Iterator[Compilation]:
     yield made
     made.close()
     assert not made._thread.is_alive()
+
+
+def test_nothing_is_compiled_before_the_first_page_unless_somebody_waits(
+    compiler: Compiler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compilation, "FIRST_PAGE_S", 1e6)
+    made = Compilation(["mc-exact", "auto"])
+    made.start()
+    assert not compiler.asked
+    said: list[str] = []
+    waiting = threading.Thread(target=made.wait_for, args=("auto", Watch(), said.append), daemon=True)
+    waiting.start()
+    until(lambda: compiler.asked == ["auto"])
+    compiler.go_on.release()
+    waiting.join(LIMIT_S)
+    assert not waiting.is_alive()
+    made.close()
+    assert not made._thread.is_alive()
+
+
+def test_an_end_does_not_wait_for_the_first_page(compiler: Compiler, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compilation, "FIRST_PAGE_S", 1e6)
+    made = Compilation(["mc-exact"])
+    made.start()
+    made.close()
+    assert not made._thread.is_alive()
+    assert not compiler.asked
 
 
 def test_who_waits_is_next_and_goes_on_when_it_is_ready(running: Compilation, compiler: Compiler) -> None:

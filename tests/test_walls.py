@@ -58,6 +58,7 @@ FLOORS = (
         "spherloc_viz.layers",
         "spherloc_viz.options",
         "spherloc_viz.given_files",
+        "spherloc_viz.importing",
         "spherloc_viz.share",
         "spherloc_viz",
     ),

@@ -14,6 +14,8 @@ EARLY = ("mc-exact", "ransac-2p", "auto")
 PAUSE_S = 0.05
 CLOSING_S = 1.0
 """How long an end waits for a kernel that is being loaded."""
+FIRST_PAGE_S = 2.0
+"""How long nothing is loaded or compiled, so that a page that is opened at once is ready sooner."""
 
 
 class Compilation:
@@ -23,6 +25,7 @@ class Compilation:
         self._waiting = list(estimators)
         self._lock = threading.Lock()
         self._stopped = threading.Event()
+        self._wanted = threading.Event()
         self._thread = threading.Thread(target=self._compile_all, name="compilation", daemon=True)
 
     def start(self) -> None:
@@ -32,6 +35,7 @@ class Compilation:
     def close(self) -> None:
         """End it with its processes."""
         self._stopped.set()
+        self._wanted.set()
         if self._thread.ident is not None:
             self._thread.join(CLOSING_S)
 
@@ -45,12 +49,14 @@ class Compilation:
                 return
             self._waiting.remove(estimator)
             self._waiting.insert(0, estimator)
+        self._wanted.set()
         say(f"Compiling {estimator}, once after an installation …")
         while estimator in self._waiting and self._thread.is_alive():
             watch.check()
             time.sleep(PAUSE_S)
 
     def _compile_all(self) -> None:
+        self._wanted.wait(FIRST_PAGE_S)
         while self._waiting and not self._stopped.is_set():
             estimator = self._waiting[0]
             compile_apart(estimator, self._stopped.is_set)

@@ -16,6 +16,7 @@ from spherloc_viz import given_files
 from spherloc_viz.commands import recording_commands as of_runs
 from spherloc_viz.commands import scene_commands as of_scenes
 from spherloc_viz.commands.flags import INTERRUPTED, RECORDINGS, Flag, OptionalFloat, OptionalPath, refuse_repeated
+from spherloc_viz.importing import importing
 
 BROKEN_PIPE = 141
 """Exit code where the reader of the output has gone, as shells have it."""
@@ -65,7 +66,8 @@ def play(
     start = None if scene is None else scene_path(scene)
     if start is not None:
         given_files.check_scene_file(start)
-    from spherloc_viz.app.server import serve
+    with importing():
+        from spherloc_viz.app.server import serve
 
     serve(start, host, port, recordings, record=record, allow=allow, keep_gigabytes=keep_gigabytes, token=token)
     return 0
