@@ -62,7 +62,7 @@ def place_rest(
     for round_number in count(1):
         left = [view for view in views if view.name not in made.poses and view.name not in elsewhere]
         placed: dict[str, _Placed] = {}
-        unit = arbitrary_scale(made.poses).metres_per_unit
+        unit = arbitrary_scale(made.depths()).metres_per_unit
         for done, view in enumerate(left, start=1):
             one = _place(made, view, gravity.get(view.name), level, unit)
             if one is not None and _undoubted(made, names, view.name, one):

@@ -158,5 +158,5 @@ def scale_of(made: Reconstruction, level: Level, measured: Measured) -> Scale:
         if measured.positions is not None:
             return scale_by_positions(made.poses, measured.positions, level)
     except InputError as error:
-        return replace(arbitrary_scale(made.poses), why_unknown=str(error))
-    return arbitrary_scale(made.poses)
+        return replace(arbitrary_scale(made.depths()), why_unknown=str(error))
+    return arbitrary_scale(made.depths())

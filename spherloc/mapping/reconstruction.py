@@ -109,6 +109,13 @@ class Reconstruction:
         """Positions (N, 3) of the points in the model's present frame."""
         return np.array([point.xyz for point in self.model.points3D.values()]).reshape(-1, 3)
 
+    def depths(self) -> FloatArray:
+        """Distance (N,) of each point to an image that sees it, in units of the model's present frame."""
+        centres = {number: self.model.image(number).projection_center() for number in self.model.reg_image_ids()}
+        points = self.model.points3D.values()
+        seen_from = [centres[point.track.elements[0].image_id] for point in points]
+        return np.linalg.norm(self.points() - np.reshape(seen_from, (-1, 3)), axis=1)
+
 
 def reconstruct(
     views: Sequence[View],

@@ -26,6 +26,8 @@ the median of all images, has a wrong pose: at a place that looks like the right
 GROUND_SHARE = 0.1
 """Share of the points below the cameras that lies deeper than the ground: reflections, wrong points."""
 MIN_GROUND_POINTS = 30
+MEDIAN_DEPTH = 10.0
+"""Median distance of a point to an image that sees it, in units of a map whose scale is unknown."""
 
 
 @dataclass(frozen=True)
@@ -162,13 +164,13 @@ def scale_by_positions(poses: Mapping[str, FloatArray], positions: Positions, le
     return Scale(found.scale, source, off_m=off_m)
 
 
-def arbitrary_scale(poses: Mapping[str, FloatArray]) -> Scale:
-    """The scale at which the median distance between an image of ``poses`` (3, 4) and its nearest one is one unit."""
-    centres = np.stack([camera_centre(pose) for pose in poses.values()])
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
-    np.fill_diagonal(apart, np.inf)
-    nearest = float(np.median(apart.min(axis=1)))
-    return Scale(1.0 / nearest if nearest > 0.0 else 1.0, "")
+def arbitrary_scale(depths: FloatArray) -> Scale:
+    """The scale at which the median of ``depths`` (N,), distances of points to images that see them, is ten units.
+
+    Limits of positions, which are a tenth of a unit, then are a hundredth of that distance, for a rig whose cameras are
+    a hand apart as for images along a street.
+    """
+    return Scale(MEDIAN_DEPTH / float(np.median(depths)) if len(depths) else 1.0, "")
 
 
 def upright_frame(level: Level) -> FloatArray:

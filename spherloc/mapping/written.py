@@ -104,7 +104,7 @@ def cameras_of(views: Sequence[View]) -> dict[str, Camera]:
 
 
 def _about(made: Reconstruction, level: Level, scale: Scale, count: int) -> str:
-    units = f"metres: {scale.source}" if scale.source else "unknown, one is the usual distance between two images"
+    units = f"metres: {scale.source}" if scale.source else "unknown, ten are the usual distance of a point to an image"
     return (
         f"Map of {len(made.poses)} of {count} images, {len(made.model.points3D):,} points. "
         f"Units are {units}. Down is from {level.source}."

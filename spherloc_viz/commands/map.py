@@ -217,7 +217,7 @@ def map_report(made: Map, found: Photographs) -> str:
     """The report as a page that needs no other files."""
     written, views = made.written, found.views
     names = [view.name for view in views]
-    scale = made.scale.source or "unknown: one unit is the usual distance between two neighbouring images"
+    scale = made.scale.source or "unknown: ten units are the usual distance of a point to an image"
     if made.scale.why_unknown:
         scale += f" ({made.scale.why_unknown.rstrip('.')})"
     facts = {

@@ -114,6 +114,14 @@ def test_a_distance_to_an_image_that_is_not_in_the_map_leaves_the_units_unknown(
     scale = scale_of(less, made.level, Measured(distance=(name, other, 5.9)))
     assert scale.source == "" and f"'{name}' did not get into the map" in scale.why_unknown
     assert scale_of(made.made, made.level, Measured(distance=(name, other, 5.9))).metres_per_unit > 0.0
+    centres = {number: made.made.model.image(number).projection_center() for number in made.made.model.reg_image_ids()}
+    far = np.array([
+        [reach([np.linalg.norm(point.xyz - centres[seen.image_id]) for seen in point.track.elements])
+         for reach in (min, max)]
+        for point in made.made.model.points3D.values()
+    ])  # fmt: skip
+    nearest, farthest = scale.metres_per_unit * np.median(far, axis=0)
+    assert nearest < 10.0 < farthest < 20.0  # units
 
 
 def test_the_calibration_beside_the_photographs_is_taken(tmp_path, rng):
