@@ -7,6 +7,7 @@ margin, which is 0 at its limit; the smallest margin is the run's score.
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -17,9 +18,10 @@ from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.evidence import FEW, LOOSE_ENDS, different, pose_sd
 from spherloc.free_gravity import MAX_NFA, MIN_LEAD, count_distinct, expected_by_chance, lead, nearby_support
+from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.problem import AlignedProblem
-from spherloc.refine import RefinementOptions, gravity_sd_rad, residuals_px
+from spherloc.refine import gravity_sd_rad, residuals_px
 from spherloc.trace import ConsensusStage, RefinementStage, Trace
 from spherloc.types import BoolArray, FloatArray
 
@@ -40,6 +42,18 @@ class Outcome(StrEnum):
     """There is a pose, but chance, an alternative pose, another gravity or its covariance speaks against it."""
     FAILED = "failed"
     """There is no pose."""
+
+
+def count_within_noise(trace: Trace) -> int:
+    """How many inliers are within the bound on the noise at the reported pose.
+
+    Fewer than the inliers where these were counted at a bound that allows for the error of gravity too.
+    """
+    if trace.cam_from_map is None:
+        return 0
+    aligned = trace.problem.aligned
+    errors = residuals_px(aligned, aligned.align_pose(trace.cam_from_map))
+    return int(np.count_nonzero(trace.inlier_mask & aligned.full_mask(errors <= float(trace.options.bound_px))))
 
 
 @dataclass(frozen=True)
@@ -85,7 +99,7 @@ def _judge(trace: Trace) -> Judgement:
     found = [
         _chance_margin(len(aligned.points), size, rate, fixed_by),
         _alternative_margin(trace, aligned, state, errors, size, rate, fixed_by),
-        _gravity_margin(aligned, state, bound_px, inliers, trace.options),
+        _gravity_margin(aligned, state, errors, inliers, trace.options),
         _error_margin(trace, aligned, state, inliers),
     ]
     score = min(margin for margin, _ in found)
@@ -128,9 +142,16 @@ def _alternative_margin(
 
 
 def _gravity_margin(
-    aligned: AlignedProblem, state: FloatArray, bound_px: float, inliers: BoolArray, options: RefinementOptions
+    aligned: AlignedProblem, state: FloatArray, errors: FloatArray, inliers: BoolArray, options: Any
 ) -> tuple[float, str]:
-    """Margin against poses nearby that ignore the given gravity and explain more."""
+    """Margin against poses nearby that ignore the given gravity and explain more.
+
+    Where the options keep the given gravity, inliers are counted at a bound that allows for its error; those of them
+    count that agree within the bound on the noise, as the others do.
+    """
+    bound_px = float(options.bound_px)
+    if gravity_sd_rad(aligned, options) < MIN_GRAVITY_SD_RAD:
+        inliers = inliers & (errors <= bound_px)
     size = count_distinct(aligned, inliers)
     free = nearby_support(aligned, state, bound_px, float(options.noise_px))
     return (

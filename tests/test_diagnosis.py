@@ -1,5 +1,6 @@
 """The diagnosis names the cause of cases that are made to fail, says so with numbers, and tells truth from data."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, diagnose
 from spherloc.diagnosis.evidence import apart, pose_sd
 from spherloc.estimators import default_options, estimate
+from spherloc.estimators.base import options_type
 from spherloc.problem import Problem
 from spherloc.refine import RefinementOptions, refine, residuals_px
 from spherloc.trace import ConsensusStage
@@ -173,6 +175,24 @@ def test_one_wrong_match_does_not_hide_a_degenerate_set(traces):
         open_m = pose_sd(aligned, true, mask, 1.0, 0.0, 0)[1]
         mask[np.flatnonzero(~mask)[:1]] = True
         assert pose_sd(aligned, true, mask, 1.0, 0.0, 1)[1] > 0.7 * open_m > 0.07
+
+
+def test_a_right_pose_that_another_outdoes_does_not_say_that_none_comes_near(scene_of):
+    """By the truth a run can be right although it has missed the best pose."""
+    scene = scene_of("mei", correspondences=100, outlier_rate=0.7)
+    options = {"bound_px": 1.5, "iterations": 10, "local_optimization": False}
+    found = []
+    for seed in range(30):
+        said = diagnose(estimate(scene.problem(seed), "ransac-2p", options_type("ransac-2p")(**options), seed))
+        if said.cause is Cause.OK:
+            told = " ".join(said.evidence)
+            own, best = (
+                re.search(words, told) for words in (r"(\d+) of 100 matches agree", r"a pose that (\d+) agree")
+            )
+            found.append(best is not None and int(own[1]) < 0.85 * int(best[1]))
+            assert found[-1] == ("a longer search finds one" in said.summary)
+            assert found[-1] <= ("no other pose" not in said.summary)
+    assert True in found and False in found
 
 
 def test_real_matches_that_fail_for_a_known_cause():

@@ -222,14 +222,14 @@ def test_the_decision_has_its_reason_and_its_numbers(exact: Trace) -> None:
 @pytest.mark.parametrize(
     ("certificate", "said", "knowable"),
     [
-        (Certificate(42, 42, 2e-9), "Proven optimal: no pose explains more than 42", True),
-        (Certificate(45, 42, 0.0), "so at most 3 more", True),
+        (Certificate(20, 20, 2e-9), "Proven optimal: no pose explains more than 20", True),
+        (Certificate(23, 20, 0.0), "so at most 3 more", True),
         (Certificate(5, 5, 0.01), "Proven optimal", False),
         (Certificate(5, 4, np.inf), "so at most 1 more", False),
     ],
 )
 def test_the_certificate_is_in_the_outcome(exact: Trace, certificate: Certificate, said: str, knowable: bool) -> None:
-    mask = np.arange(len(exact.problem)) < certificate.lower_bound
+    mask = exact.inlier_mask & (np.cumsum(exact.inlier_mask) <= certificate.lower_bound)
     trace = replace(exact, certificate=certificate, inlier_mask=mask)
     picture, rows = at(trace, "outcome"), dict(outcome_table(trace).rows)
     assert said in rows["certificate"] and said.lower() in picture.step.caption.lower()
@@ -255,6 +255,19 @@ def test_a_certificate_of_another_number_than_the_inliers_is_explained(
     assert dict(outcome_table(trace).rows)["certificate"].endswith(proof.format(best))
     note = at(trace, "outcome").step.note
     assert why in note and ("count" in note) == bool(why)
+
+
+def test_inliers_beyond_the_bound_on_the_noise_are_told_apart(exact: Trace) -> None:
+    """Where gravity is kept, inliers are counted at a bound that allows for its error; the certificate's are not."""
+    within = int(np.count_nonzero(exact.inlier_mask))
+    more = exact.inlier_mask | (np.cumsum(~exact.inlier_mask) <= 5)
+    trace = replace(exact, inlier_mask=more, certificate=Certificate(within + 5, within + 5, 1e-30))
+    picture, rows = at(trace, "outcome"), dict(outcome_table(trace).rows)
+    assert f"may add, {within} of them within 3 px" in picture.step.caption
+    assert f"before refinement {within + 5}, which is proven optimal" in picture.step.caption
+    assert f"this pose keeps the given gravity and has {within} such matches" in picture.step.note
+    assert rows["inliers"].startswith(f"{within + 5} of ")
+    assert rows["inliers"].endswith(f", {within} within the bound on the noise")
 
 
 @pytest.mark.parametrize("size", [2, 3, 6])

@@ -69,6 +69,17 @@ def test_two_matches_and_repeated_ones_are_no_evidence(scene_of, estimator):
         assert judged.outcome is not Outcome.LOCALIZED and judged.reasons
 
 
+def test_a_refinement_that_keeps_a_wrong_gravity_is_doubtful(scene_of):
+    """Its inliers are counted at a bound that allows for gravity's error, so that another pose has no more of them."""
+    scene = scene_of("mei", outlier_rate=0.5, gravity_error_deg=1.0)
+    wrong, believed = 0, 0
+    for seed in range(12):
+        trace = solved(scene.problem(seed), "mc-exact", gravity_sd_deg=0.0)
+        wrong += not evaluate(trace).success
+        believed += judge(trace).outcome is Outcome.LOCALIZED and not evaluate(trace).success
+    assert wrong >= 4 and not believed
+
+
 def test_no_pose_has_failed_and_a_judgement_is_repeatable(scene_of):
     trace = solved(scene_of("fisheye", outlier_rate=0.9).problem(2))
     assert judge(trace) == judge(trace)

@@ -17,7 +17,7 @@ from spherloc.diagnosis.evidence import (
     gather_truth,
     measures_of,
 )
-from spherloc.diagnosis.words import describe
+from spherloc.diagnosis.words import MISSED, STRONG, describe
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.trace import RansacStage, Trace
 
@@ -43,10 +43,6 @@ AS_GOOD = 0.9
 matches within the wider bound may have pulled it away."""
 EQUAL = 0.88
 """Least ratio of the supports of two poses that count as equal; noise moves matches over the bound."""
-STRONG = 0.45
-"""A second pose with at least this share of the best one's support is not chance: structure repeats itself."""
-MISSED = 0.85
-"""A run has missed the best pose if its own has less than this share of the best one's support."""
 TILT_RAD = np.radians(0.05)
 """A true gravity that is beyond what the run allows for by more than this explains a wrong, well supported pose."""
 TO_BE_PROVEN = (Cause.FALSE_CONSENSUS, Cause.AMBIGUOUS, Cause.ITERATIONS_RAN_OUT, Cause.SEARCH_MISSED)

@@ -41,6 +41,10 @@ def describe(
     )
 
 
+MISSED = 0.85
+"""A run has missed the best pose if its own has less than this share of the best one's support."""
+STRONG = 0.45
+"""A second pose with at least this share of the best one's support is not chance: structure repeats itself."""
 FAR = 3.0
 """Number of noise bounds beyond which the errors of most right matches are not noise."""
 
@@ -86,7 +90,7 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
     run, best, second = (0 if fit is None else fit.support(bound) for fit in (e.run, e.best, other))
     match cause:
         case Cause.OK:
-            return f"{run} of {total} matches agree within {bound:.3g} px, and no other pose comes near."
+            return f"{run} of {total} matches agree within {bound:.3g} px, {_compared(e, run)}."
         case Cause.TOO_FEW_INLIERS if truth is not None:
             return f"Only {np.count_nonzero(truth.right)} of {total} matches are right, no more than chance gives."
         case Cause.TOO_FEW_INLIERS:
@@ -108,6 +112,16 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
         case Cause.UNKNOWN:
             return f"The pose is off the true one, though {run} of {total} matches agree with it and fix it well."
     return _measured_summary(e, truth, cause, unit)
+
+
+def _compared(e: Evidence, run: int) -> str:
+    """What other poses have where a run is right with so many matches; the truth can say so although one has more."""
+    best, other = (0 if fit is None else fit.support(e.bound_px) for fit in (e.best, e.alternative))
+    if run < MISSED * best:
+        return f"and the pose is right, though a longer search finds one that {best} agree with"
+    if other >= STRONG * run:
+        return f"and the pose is right, though another one has {other}"
+    return "and no other pose comes near"
 
 
 def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause, unit: str) -> str:

@@ -16,7 +16,7 @@ from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import InputError, RecordingError, SpherlocError, legible
 from spherloc.estimators import default_options, options_type
 from spherloc.metrics import evaluate
-from spherloc.outcome import Outcome, judge
+from spherloc.outcome import Outcome, count_within_noise, judge
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.warm_up import warm_up
@@ -246,10 +246,9 @@ def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | No
     else:
         rows = "\n".join("    " + " ".join(f"{value: .6f}" for value in row) for row in pose)
         lines.append(f"  cam_from_map\n{rows}")
-    lines.append(
-        f"  {np.count_nonzero(trace.inlier_mask)} of {len(trace.problem)} matches are inliers, "
-        f"{trace.timings_ms['total']:.1f} ms"
-    )
+    inliers, explained = int(np.count_nonzero(trace.inlier_mask)), count_within_noise(trace)
+    within = f", {explained} within the bound on the noise" if explained < inliers else ""
+    lines.append(f"  {inliers} of {len(trace.problem)} matches are inliers{within}, {trace.timings_ms['total']:.1f} ms")
     if trace.problem.gravity_source:
         lines.append(f"  gravity {legible(_gravity(trace.problem))}")
     judged = judge(trace)
@@ -267,7 +266,7 @@ def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | No
         # Only now: the layers take half a second.
         from spherloc_viz.layers.outcome import chance, proof, warning
 
-        proven = proof(trace.certificate, int(np.count_nonzero(trace.inlier_mask)))
+        proven = proof(trace.certificate, count_within_noise(trace))
         lines.append(f"  {proven}; NFA (expected number of false sets of this size): {chance(trace.certificate)}")
         lines += [f"  {sentence}" for sentence in (warning(trace.certificate),) if sentence]
     if diagnosis.doubtful:

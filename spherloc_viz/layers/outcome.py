@@ -4,7 +4,7 @@ import numpy as np
 
 from spherloc.geometry import camera_centre
 from spherloc.metrics import SUCCESS_M, evaluate
-from spherloc.outcome import Judgement, judge
+from spherloc.outcome import Judgement, count_within_noise, judge
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
@@ -16,19 +16,28 @@ KNOWABLE = 0.01
 UNKNOWABLE = "the answer cannot be known"
 
 
-def proof(certificate: Certificate, inliers: int) -> str:
-    """Whether a pose may exist that beats the best known one, as part of a sentence on a run with so many inliers."""
+def proof(certificate: Certificate, explained: int) -> str:
+    """Whether a pose may exist that beats the best known one, as part of a sentence on a run whose pose explains so
+    many matches within the bound on the noise."""
     lower, gap = certificate.lower_bound, certificate.gap
     if not certificate.proven:
-        known = "" if inliers == lower else f" than the {lower} of the best known pose"
+        known = "" if explained == lower else f" than the {lower} of the best known pose"
         return f"not proven optimal: no pose explains more than {certificate.upper_bound}, so at most {gap} more{known}"
-    if inliers == lower:
+    if explained == lower:
         return f"proven optimal: no pose explains more than {lower}"
     return f"before refinement {lower}, which is proven optimal: no pose explains more"
 
 
-def difference(certificate: Certificate, inliers: int) -> str:
-    """A sentence that says why a run with so many inliers has a certificate of another number; empty if it has not."""
+def difference(certificate: Certificate, inliers: int, explained: int) -> str:
+    """A sentence that says why a run with so many inliers has a certificate of another number; empty if it has not.
+
+    ``explained`` of them are within the bound on the noise, which the certificate counts with.
+    """
+    if explained < inliers:
+        return (
+            "The certificate counts matches within the bound on the noise, at poses within the gravity bound; this "
+            f"pose keeps the given gravity and has {explained} such matches."
+        )
     if inliers < certificate.lower_bound:
         return "Refinement makes the squared residuals small, not the count large: matches near the bound can drop out."
     if inliers > certificate.upper_bound:
@@ -84,10 +93,14 @@ def _no_pose(view: RunView) -> Frame:
 def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
     trace, metrics = view.trace, evaluate(view.trace)
     remark = trace.message.partition(". ")[2]
-    inliers = int(np.count_nonzero(trace.inlier_mask))
+    inliers, explained = int(np.count_nonzero(trace.inlier_mask)), count_within_noise(trace)
     total = trace.timings_ms["total"]
-    proven, chances = ("", "") if trace.certificate is None else _certified(trace.certificate, inliers)
-    caption = f"{inliers} of {len(trace.problem)} matches agree with the pose, found in {total:.1f} ms{proven}. "
+    proven, chances = ("", "") if trace.certificate is None else _certified(trace.certificate, inliers, explained)
+    caption = f"{inliers} of {len(trace.problem)} matches agree with the pose"
+    if explained < inliers:
+        bound = f"{view.bounds.noise_px:.3g} px"
+        caption += f" within {bound} and what the error of gravity may add, {explained} of them within {bound}"
+    caption += f", found in {total:.1f} ms{proven}. "
     if metrics.rotation_error_deg is None or metrics.translation_error_m is None:
         caption += "The truth is unknown, so the share of agreeing matches is all there is to judge it by."
     else:
@@ -107,11 +120,11 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
     )
 
 
-def _certified(certificate: Certificate, inliers: int) -> tuple[str, str]:
+def _certified(certificate: Certificate, inliers: int, explained: int) -> tuple[str, str]:
     """The proven bounds, as the end of a sentence, and as a note why they differ from the inliers, and the NFA."""
     chances = f"NFA: {chance(certificate)} sets of {certificate.lower_bound} matches are expected to agree by chance."
-    notes = (difference(certificate, inliers), chances, warning(certificate))
-    return f"; {proof(certificate, inliers)}", " ".join(filter(None, notes))
+    notes = (difference(certificate, inliers, explained), chances, warning(certificate))
+    return f"; {proof(certificate, explained)}", " ".join(filter(None, notes))
 
 
 def outcome_table(trace: Trace) -> Table:
@@ -132,12 +145,14 @@ def early_table(trace: Trace, judged: Judgement | None) -> Table:
     refinement = trace.stage(RefinementStage)
     if refinement is not None and trace.cam_from_map is not None:
         rows.append(("expected error", uncertainty.spread(refinement, trace.problem.metric)))
-    rows.append(("inliers", f"{np.count_nonzero(trace.inlier_mask)} of {len(trace.problem)}"))
+    inliers, explained = int(np.count_nonzero(trace.inlier_mask)), count_within_noise(trace)
+    within = f", {explained} within the bound on the noise" if explained < inliers else ""
+    rows.append(("inliers", f"{inliers} of {len(trace.problem)}{within}"))
     if metrics.precision is not None and metrics.recall is not None and metrics.f1 is not None:
         rows.append(("precision / recall", f"{100 * metrics.precision:.0f} % / {100 * metrics.recall:.0f} %"))
         rows.append(("F1", f"{100 * metrics.f1:.0f} %"))
     if trace.certificate is not None:
-        rows += _certificate_rows(trace.certificate, int(np.count_nonzero(trace.inlier_mask)))
+        rows += _certificate_rows(trace.certificate, explained)
     stages = ", ".join(f"{name} {value:.1f}" for name, value in trace.timings_ms.items() if name != "total")
     rows.append(("time", f"{trace.timings_ms['total']:.1f} ms" + (f" ({stages})" if stages else "")))
     return Table("outcome", ("", "this run"), tuple(rows))
@@ -147,8 +162,8 @@ def _judged(judged: Judgement) -> str:
     return " ".join((f"{judged.outcome}{':' * bool(judged.reasons)}", *judged.reasons))
 
 
-def _certificate_rows(certificate: Certificate, inliers: int) -> list[tuple[str, str]]:
-    rows = [("certificate", proof(certificate, inliers).capitalize())]
+def _certificate_rows(certificate: Certificate, explained: int) -> list[tuple[str, str]]:
+    rows = [("certificate", proof(certificate, explained).capitalize())]
     rows.append(("NFA", f"{chance(certificate)} sets of {certificate.lower_bound} matches expected to agree by chance"))
     if not is_knowable(certificate):
         rows.append(("warning", UNKNOWABLE))
