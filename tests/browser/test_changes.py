@@ -30,7 +30,6 @@ from spherloc_viz.app.web.viser_internals import (
 )
 from tests.waiting import LIMIT_S
 
-pytestmark = pytest.mark.browser
 KEY = "a key of this test"
 HANDLE = "/handle"
 

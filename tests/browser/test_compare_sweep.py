@@ -59,8 +59,6 @@ class Patient:
 '''
 CELLS = "rows => rows.map(row => [...row.cells].map(cell => cell.innerText))"
 
-pytestmark = pytest.mark.browser
-
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:

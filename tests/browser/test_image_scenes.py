@@ -47,8 +47,6 @@ start = 0.05
 stop = 0.25
 """
 
-pytestmark = pytest.mark.browser
-
 
 @pytest.fixture(scope="module")
 def images_address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:

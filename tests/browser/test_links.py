@@ -6,14 +6,11 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
-import pytest
 from playground import SCENE, Playground, served
 from playwright.sync_api import Browser, expect
 
 from spherloc_viz.app.audience import ABOUT
 from spherloc_viz.app.web.access import NO_TOKEN
-
-pytestmark = pytest.mark.browser
 
 
 def test_each_link_opens_its_own_page(browser: Browser, tmp_path: Path) -> None:

@@ -21,8 +21,6 @@ from tests.waiting import LIMIT_S, until
 
 CAMERA = '[camera]\nmodel = "equirectangular"\nwidth = 2048\nheight = 1024\n'
 
-pytestmark = pytest.mark.browser
-
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -3,7 +3,6 @@
 import re
 from pathlib import Path
 
-import pytest
 from playground import SCENE, Playground
 from playwright.sync_api import Browser, expect
 
@@ -14,8 +13,6 @@ from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Balls, Picture, Points, Segments, Step
 
 EXACT, RANSAC = "mc-exact (exact, certified)", "ransac-2p (two points)"
-
-pytestmark = pytest.mark.browser
 
 
 def test_page_shows_a_localization_and_talks_to_nobody_else(tab: Playground, address: str) -> None:

@@ -15,8 +15,6 @@ from playwright.sync_api import Browser, Locator, expect
 from spherloc_viz.recording.content.data import read_run_row
 from spherloc_viz.recording.reviews import read_review
 
-pytestmark = pytest.mark.browser
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:

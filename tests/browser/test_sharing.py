@@ -31,8 +31,6 @@ OUTCOMES = {
 }
 """What the story of each preset promises."""
 
-pytestmark = pytest.mark.browser
-
 
 def go_to(tab: Playground, name: str) -> None:
     tab.page.get_by_role("tab", name=name, exact=True).click()

@@ -9,8 +9,6 @@ import pytest
 from playground import Playground
 from playwright.sync_api import Browser, Page
 
-pytestmark = pytest.mark.browser
-
 OPEN_SOCKET = """address => new Promise(done => {
     const socket = new WebSocket(address, ["viser-v1.1.1"]);
     socket.onopen = () => done("open");

@@ -13,8 +13,6 @@ from spherloc.trace import Trace
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.layers.matches import match_rows
 
-pytestmark = pytest.mark.browser
-
 
 @pytest.fixture(scope="module")
 def trace(tmp_path_factory: pytest.TempPathFactory) -> Trace:

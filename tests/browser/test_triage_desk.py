@@ -19,8 +19,6 @@ from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.reviews import read_review
 from tests.waiting import until
 
-pytestmark = pytest.mark.browser
-
 WRONG = (0, 3, 4, 5)
 """Seeds of problems for which three samples give a wrong pose."""
 SEEDS = len(WRONG)

@@ -21,8 +21,6 @@ from spherloc_viz.recording.reviews import write_review
 from spherloc_viz.recording.run_row import RunRow
 from tests.waiting import until
 
-pytestmark = pytest.mark.browser
-
 SIZE = {"width": 1000, "height": 600}
 PAUSED = 1
 OPENING_MS = 200_000

@@ -5,13 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 from playground import PAINT, Playground
 from playwright.sync_api import expect
 
 from spherloc_viz.recording.content.data import read_recording
-
-pytestmark = pytest.mark.browser
 
 EXACT = "mc-exact (exact, certified)"
 MIN_CONTRAST = 4.5
