@@ -17,7 +17,7 @@ from spherloc.trace import ConsensusStage, RansacStage, RefinementStage, Stage, 
 from spherloc_viz import style
 from spherloc_viz.layers import paint, ring, steps, yaw
 from spherloc_viz.layers.frame import RunView
-from spherloc_viz.layers.primitives import Balls, Picture, Points, SceneItem, Segments, true_minus
+from spherloc_viz.layers.primitives import Balls, Label, Picture, Points, SceneItem, Segments, true_minus
 from spherloc_viz.layers.ransac import MAX_IMPROVEMENTS
 from spherloc_viz.layers.translation import BallSet
 from spherloc_viz.layers.yaw import Arcs
@@ -344,6 +344,18 @@ def test_peaks_of_the_bound_come_from_the_highest_down(exact: Trace) -> None:
         assert f"no pose explains more than {height} of" in picture.step.caption
         assert ("not excluded" in picture.step.caption) == (height > stage.support[0])
     assert len(keys) >= 5 and heights == sorted(heights, reverse=True) and heights[0] == stage.bound.max()
+
+
+def test_a_bound_that_is_the_same_at_every_yaw_has_no_peaks() -> None:
+    """A search over positions alone bounds all yaws together."""
+    flat = exact_run(bound=np.full(1440, 26, np.int32))
+    assert not keys_like(flat, r"consensus-yaw-\d+")
+    picture = at(flat, "consensus-bound")
+    assert picture.step.title == "What no pose can beat"
+    bars = next(found for found in picture.scene if found.name == "ring/bars")
+    assert isinstance(bars, Segments) and not (bars.colors == style.CLIQUE).all(axis=-1).any()
+    names = [found.text for found in picture.scene if isinstance(found, Label)]
+    assert "bound: at most 26 matches at any yaw" in names
 
 
 def test_verified_poses_explain_as_many_as_they_say() -> None:

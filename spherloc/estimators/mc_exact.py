@@ -3,8 +3,9 @@
 Two exact searches share what they find: one over yaw that compares pairs of correspondences
 (``consensus.exact``; gravity exact, few correspondences or few inliers), and one over camera positions, yaw and tilt
 (``consensus.positions``), which needs memory for the correspondences only. Each starts from the other's best pose;
-after a comparison of pairs the search over positions leaves out the yaws that it has excluded. Both begin with a pose within the gravity bound that explains many
-matches within the noise bound alone, from 2P-RANSAC and, where gravity is uncertain, robust fits to its hypotheses.
+after a comparison of pairs the search over positions leaves out the yaws that it has excluded. Both begin with a pose
+within the gravity bound that explains many matches within the noise bound alone, from 2P-RANSAC and, where gravity is
+uncertain, robust fits to its hypotheses.
 """
 
 from dataclasses import dataclass

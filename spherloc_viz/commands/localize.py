@@ -275,8 +275,8 @@ def _text(results: SequenceResults, summary: Summary) -> str:
         lines.append(f"  median registration error {setting.length(summary.median_registration_error_m)}")
     if summary.mean_f1 is not None:
         lines.append(
-            f"  inliers against matches within 8 px of the truth: mean precision {summary.mean_precision:.3f}, recall {summary.mean_recall:.3f}, "
-            f"F1 {summary.mean_f1:.3f}"
+            f"  inliers against matches within 8 px of the truth: mean precision {summary.mean_precision:.3f}, "
+            f"recall {summary.mean_recall:.3f}, F1 {summary.mean_f1:.3f}"
         )
     if summary.median_estimating_ms is not None:
         lines.append(

@@ -27,18 +27,30 @@ def highest_bound(stage: ConsensusStage) -> int:
     return int(stage.bound.max())
 
 
+def is_same_everywhere(stage: ConsensusStage) -> bool:
+    """Whether the bound is one number: a search over positions proves it for all yaws together."""
+    return bool(stage.bound.min() == stage.bound.max())
+
+
 def best_support(stage: ConsensusStage) -> int:
     """Number of correspondences that the best known pose explains."""
     return int(stage.support.max(initial=stage.seed_support))
 
 
 def _bound_plans(view: RunView, stage: ConsensusStage) -> list[Plan]:
-    """Steps for the first guess, the bound, and its peaks from the highest down."""
+    """Steps for the first guess, the bound, and its peaks, if it has any, from the highest down."""
     charts = {"consensus": partial(bound_chart, view, stage)}
     out = [
         Plan("consensus-guess", "The first guess", lambda: _guess(view, stage)),
-        Plan("consensus-bound", "What no pose can beat, at each yaw", lambda: _bound(view, stage), charts),
+        Plan(
+            "consensus-bound",
+            "What no pose can beat" if is_same_everywhere(stage) else "What no pose can beat, at each yaw",
+            lambda: _bound(view, stage),
+            charts,
+        ),
     ]
+    if is_same_everywhere(stage):
+        return out
     peaks = ring.peaks(stage.bound, REACH, PEAKS)
     for rank, place in enumerate(peaks.tolist(), 1):
         yaw = ring.degrees_of(place + 0.5, len(stage.bound))
@@ -84,9 +96,16 @@ def _bound(view: RunView, stage: ConsensusStage) -> Frame:
         note=_effort(stage),
         items=(
             *_ring(view, stage),
-            ring.name("ring/name", view, stage.yaw_rad + np.pi, "bound: most matches at each yaw"),
+            ring.name("ring/name", view, stage.yaw_rad + np.pi, f"bound: {_heights(stage)}"),
         ),
     )
+
+
+def _heights(stage: ConsensusStage) -> str:
+    """What the heights of the bars are."""
+    if is_same_everywhere(stage):
+        return f"at most {highest_bound(stage)} matches at any yaw"
+    return "most matches at each yaw"
 
 
 def _effort(stage: ConsensusStage) -> str:
@@ -147,14 +166,17 @@ def _yaw(stage: ConsensusStage) -> float | None:
 
 
 def _ring(view: RunView, stage: ConsensusStage, place: int | None = None) -> tuple[SceneItem, ...]:
-    """The bound around the sphere, in the colour of the clique where it is largest, or in that of a sample at
-    ``place``, and the best pose's support as a circle: at yaws where the bound is outside of it there may be a better
-    pose."""
+    """The bound around the sphere, and the best pose's support as a circle: at yaws where the bound is outside of it
+    there may be a better pose.
+
+    The bound is in the colour of a sample at ``place``; without one, in that of the clique where it is largest, unless
+    it is the same everywhere.
+    """
     centre, heights, most = view.middle, ring.by_degree(stage.bound), max(1, highest_bound(stage))
     feet, tops = ring.circle(view, centre, np.zeros(())), ring.circle(view, centre, heights / most)
     colors = one_color(style.UNDECIDED, len(feet))
     if place is None:
-        colors[heights == most] = style.CLIQUE
+        colors[(heights == most) & (not is_same_everywhere(stage))] = style.CLIQUE
     else:
         colors[place * len(feet) // len(stage.bound)] = style.SAMPLE
     support = ring.circle(view, centre, np.array(best_support(stage) / most))
