@@ -69,7 +69,9 @@ def test_the_ellipsoid_is_that_of_the_covariance_by_the_factor_it_states(
 ) -> None:
     spread = rng.normal(size=(6, 6))
     covariance = size**2 * spread @ spread.T
-    items = last(with_covariance(turned, covariance))
+    trace = with_covariance(turned, covariance)
+    items = items_of(paint(trace, [step.key for step in steps(trace)].index("refinement-error")))
+    assert "uncertainty/ellipsoid" in last(trace) and "uncertainty/sigmas" not in last(trace)
     lines, label = items["uncertainty/ellipsoid"], text(items["uncertainty/sigmas"])
     assert isinstance(lines, Segments) and label.startswith("3σ of the position")
     factor = int(label.partition("enlarged ")[2].removesuffix("×") or 1)

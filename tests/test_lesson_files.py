@@ -80,6 +80,13 @@ def test_a_hand_out_has_numbers_pictures_and_the_answers_at_its_end() -> None:
     assert "For the teacher" not in html
 
 
+def test_the_answers_of_a_hand_out_are_those_of_the_run_after_the_right_answer() -> None:
+    answers = handout_of(lesson_named("your-camera")).split("<h2>Answers</h2>")[1]
+    told = re.search(r"with the answer that you chose, is <b>([^<]*)</b>", answers)
+    assert told is not None and told[1] == "a success"
+    assert "<figure" in answers[told.start() - 300_000 : told.start()]
+
+
 def test_on_paper_the_camera_is_drawn_over_the_balls_around_it() -> None:
     balls = Balls("balls", "balls", np.zeros((50, 3)), np.ones(50), one_color(style.CLIQUE, 50), 0.3)
     camera = Points("camera", "poses", np.array([[0.5, 0.0, 0.0]]), one_color(style.TRUTH, 1), 0.1)

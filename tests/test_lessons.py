@@ -139,7 +139,8 @@ def test_pages_of_all_lessons_are_made():
         assert "$" not in re.sub(r"<script>.*?</script>|<style>.*?</style>", "", page, flags=re.DOTALL)
         following = re.search(r'<p class="onward"><a href="/learn/([^"]*)">', page)
         assert following is None or not lesson_named(following[1]).lecture
-    assert '<span class="whole">--estimator</span> ' in lesson_page(lesson_named("your-camera"), LESSONS)
+    assert '<span class="whole">--camera</span> ' in lesson_page(lesson_named("your-camera"), LESSONS)
+    assert re.search(r'<span class="whole"><math.*</math>,</span> with', prose_html("It is $w^2$, with the share", ""))
     assert prose_html("Half of 4 m, {off_cm} cm {slider seed 1 2 1 %}", "seed=1").count("\N{NO-BREAK SPACE}") == 2
     assert len(set(LESSONS)) == len(LESSONS), "their pictures are kept by lesson"
     listed = list_page(LESSONS, "/p/")

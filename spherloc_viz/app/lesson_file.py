@@ -141,8 +141,8 @@ def handout_of(lesson: Lesson) -> str:
 
     sheets = []
     for moment in lesson.moments:
-        shown = told(moment.state)
-        asked = told(changed_state(moment.state, moment.before)) if moment.before else shown
+        right = "" if moment.question is None else next(one.go for one in moment.question.answers if one.right)
+        shown, asked = (told(changed_state(moment.state, changes)) for changes in (right, moment.before))
         sheets.append(Sheet(*shown, *asked))
     return handout_page(lesson, sheets, lambda state: _as_data(images_of(runs, state)))
 

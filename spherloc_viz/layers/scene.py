@@ -17,7 +17,7 @@ from spherloc_viz import style
 from spherloc_viz.layers.frame import Frame, RunView, icosphere, one_color
 from spherloc_viz.layers.primitives import Label, Mesh, Points, SceneItem, Segments, Textured
 from spherloc_viz.layers.query_image import modified, sphere_texture
-from spherloc_viz.layers.uncertainty import error_items
+from spherloc_viz.layers.uncertainty import error_items, is_close_up
 
 BAR_SHARE = 0.25
 """Largest length of the scale bar, as a share of the map's width."""
@@ -105,7 +105,7 @@ def base_items(view: RunView, frame: Frame) -> tuple[SceneItem, ...]:
         *_ghost(view, frame),
         Points("map/points", "map", view.points, frame.colors, 0.07 * view.dot_m, view.numbers),
         *_sphere(view, frame),
-        *view.kept("located", (pose, frame.located), lambda: _located(view, frame)),
+        *view.kept("located", (pose, frame.located, is_close_up(frame)), lambda: _located(view, frame)),
         *view.kept("scale bar", None, lambda: scale_bar(view)),
         *view.kept("ground", None, lambda: ground(view)),
     )

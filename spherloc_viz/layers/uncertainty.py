@@ -27,6 +27,11 @@ BESIDE = 1.2
 ARC_STEP_RAD = np.radians(3.0)
 
 
+def is_close_up(frame: Frame) -> bool:
+    """Whether the step is about the sphere, which is seen from near then."""
+    return frame.focus is not None and frame.focus.view == "Sphere"
+
+
 def error_items(view: RunView, frame: Frame) -> list[SceneItem]:
     """The error of the frame's pose where the truth is known, and what its covariance allows where that is known."""
     if not frame.located:
@@ -63,18 +68,21 @@ def enlarged(factor: int) -> str:
 
 
 def _ellipsoid(view: RunView, frame: Frame, half_axes: FloatArray, factor: int) -> list[SceneItem]:
-    """The three principal ellipses of the ellipsoid: lines do not hide things inside it."""
+    """The three principal ellipses of the ellipsoid: lines do not hide things inside it.
+
+    In an overview their name would lie over that of the error, if that is known.
+    """
     centre, turns = camera_centre(frame.cam_from_map), np.linspace(0.0, 2.0 * np.pi, CORNERS + 1)
     circle = np.column_stack([np.cos(turns), np.sin(turns)])
     lines = np.concatenate([centre + circle @ np.delete(half_axes, k, axis=0) for k in range(3)])
     ends = np.stack([lines[:-1], lines[1:]], axis=1)
     ends = np.delete(ends, [CORNERS, 2 * CORNERS + 1], axis=0)
+    ellipses = Segments("uncertainty/ellipsoid", LAYER, ends, one_color(style.ESTIMATE, len(ends)), 1.5)
+    if view.truth is not None and not is_close_up(frame):
+        return [ellipses]
     top = centre - np.array([0.0, np.linalg.norm(half_axes[:, 1]) + 0.1 * view.sphere_m, 0.0])
     text = f"{SIGMAS:.0f}σ of the position{enlarged(factor)}"
-    return [
-        Segments("uncertainty/ellipsoid", LAYER, ends, one_color(style.ESTIMATE, len(ends)), 1.5),
-        Label("uncertainty/sigmas", LAYER, top, text, 0.055 * view.sphere_m),
-    ]
+    return [ellipses, Label("uncertainty/sigmas", LAYER, top, text)]
 
 
 def _offset(view: RunView, frame: Frame, factor: int) -> list[SceneItem]:

@@ -22,6 +22,7 @@ LINK = re.compile(r'<a href="#([^"]*)">')
 CODE = re.compile(r"(?<!<pre>)<code>([^<]*)</code>")
 HYPHENED = re.compile(r"[^ ]*-[^ ]*")
 """A word that a browser would break after its hyphens: a command that begins its options with them is read wrongly."""
+NBSP = "\N{NO-BREAK SPACE}"
 UNIT = re.compile(r"(?<=[\d}]) (?=(?:px|cm|m|km|%)(?![a-z]))(?![^{]*\})")
 """The space between a number, or the field of one, and its unit, where no line should end."""
 MARK, END = "\ue000", "\ue001"
@@ -92,7 +93,8 @@ def prose_html(text: str, state: str, form: Form = LIVE) -> str:
     html = _markdown().render(FORMULA.sub(keep, text))
     html = CODE.sub(lambda found: f"<code>{HYPHENED.sub(_whole, found[1])}</code>", html)
     html = LINK.sub(lambda found: _link(unescape(found[1]), state, form), html)
-    html = FIELD.sub(lambda found: _field(unescape(found[1]), state, form), UNIT.sub("\N{NO-BREAK SPACE}", html))
+    html = FIELD.sub(lambda found: _field(unescape(found[1]), state, form), UNIT.sub(NBSP, html))
+    html = re.sub(f"{MARK}\\d+{END}[,.;:?!)]+", _whole, html)  # no line begins with what follows a formula
     return re.sub(f"{MARK}(\\d+){END}", lambda found: formulas[int(found[1])], html)
 
 
@@ -277,9 +279,9 @@ class Sheet:
     """What a moment has on paper."""
 
     numbers: Mapping[str, str]
-    """Numbers of the moment's run, as text."""
+    """Numbers of the moment's run, after the right answer if it has a question, as text."""
     picture: str
-    """Its scene, SVG."""
+    """The scene of that run, SVG."""
     asked_numbers: Mapping[str, str]
     """Numbers of the run that is shown until the question is answered."""
     asked_picture: str
@@ -305,7 +307,7 @@ def handout_page(lesson: Lesson, sheets: Collection[Sheet], images: Callable[[st
                 f"{_inline(answer.shows, state, told)}</li>"
                 for answer in question.answers
             )
-            figure = _figure(sheet.picture, title) if moment.before else ""
+            figure = _figure(sheet.picture, title) if sheet.picture != sheet.asked_picture else ""
             solutions.append(
                 f'<section><h3>{place}. {title}</h3><ul class="answers">{told_why}</ul>{figure}{after}</section>'
             )
@@ -372,8 +374,8 @@ def list_page(course: Collection[Lesson], pictures: str) -> str:
         image = f'<img src="{pictures}{escape(lesson.name)}" alt="" loading="lazy">'
         rows[lesson.lecture].append(
             f'<li><a href="/learn/{escape(lesson.name)}">{image}<div><h2>{escape(lesson.title)}</h2>'
-            f"<p>{escape(lesson.summary)}</p><p class='dim'>{len(lesson.moments)} parts, about {lesson.minutes} min"
-            "</p></div></a></li>"
+            f"<p>{UNIT.sub(NBSP, escape(lesson.summary))}</p>"
+            f"<p class='dim'>{len(lesson.moments)} parts, about {lesson.minutes} min</p></div></a></li>"
         )
     return _page("list.html", lessons="".join(rows[False]), lectures="".join(rows[True]))
 

@@ -122,10 +122,10 @@
   // The teacher's notes, in a window that the class does not see (notes.js).
   function openNotes() {
     document.body.classList.remove("teacher");
-    document.body.classList.add("voting");
     if (!channel) {
       channel = new BroadcastChannel(`spherloc${location.pathname}`);
       channel.onmessage = ({ data }) => {
+        if (data === "hello" || data === "bye") document.body.classList.toggle("voting", data === "hello");
         if (data === "hello") report();
         else if (data === "reveal" && right()) answer(right());
         else if (data.startsWith("go:")) step(Number(data.slice(3)) - moments.indexOf(now));
@@ -176,8 +176,9 @@
   });
 
   addEventListener("keydown", (event) => {
-    const writing = event.target instanceof Element && event.target.closest("input,select,textarea");
-    if (writing || event.ctrlKey || event.metaKey || event.altKey) return;
+    // A remote control has the keys Page Up and Page Down only; the arrows are the slider's that has the focus.
+    const control = event.target instanceof Element && event.target.closest("input,select");
+    if ((control && !event.key.startsWith("Page")) || event.ctrlKey || event.metaKey || event.altKey) return;
     const moves = { PageDown: 1, ArrowRight: 1, PageUp: -1, ArrowLeft: -1 };
     if (event.key in moves) step(moves[event.key]);
     else if (event.key.toLowerCase() === "l") press("large");

@@ -17,6 +17,7 @@
       if (data.numbers?.[place.dataset.number]) place.textContent = data.numbers[place.dataset.number];
   };
   channel.postMessage("hello");
+  addEventListener("pagehide", () => channel.postMessage("bye"));
 
   setInterval(() => {
     const seconds = Math.floor((Date.now() - begun) / 1000), now = document.querySelector(".now");

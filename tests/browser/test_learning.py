@@ -50,8 +50,19 @@ def test_a_lesson_is_read(browser: Browser, address: str) -> None:
     assert "outlier_rate%3D0.9" in frame.url and "step=outcome" in frame.url
     expect(cost.locator(".open a")).to_have_attribute("href", re.compile("outlier_rate%3D0.9"))
 
+    # A remote control turns the pages although the slider has the focus.
+    slider.press("PageDown")
+    expect(page.locator("#moment-2")).to_have_class(re.compile("now"))
+    expect(slider).to_have_value("0.9")
+
+    # Who goes on before the scene is there sees the scene of where they are.
+    page.goto(f"{address}/learn/failures")
+    page.keyboard.press("PageDown")
+    expect(page.locator("#moment-1 [data-number=matches]")).to_have_text("60")
+    for _ in range(4):
+        page.keyboard.press("PageDown")
+
     # A link says the same state whatever link was pressed before it.
-    page.goto(f"{address}/learn/failures#m5")
     luck = page.locator("#moment-5")
     luck.locator(".right button").click()
     luck.get_by_role("link", name="Seed 0").click()
@@ -86,6 +97,8 @@ def test_the_teachers_notes_follow_in_a_window_of_their_own(browser: Browser, ad
     expect(cost.locator(".after")).to_be_hidden()
     notes.locator(".now [data-press=reveal]").click()
     expect(cost.locator(".after")).to_be_visible()
+    notes.close()
+    expect(page.locator("body")).not_to_have_class(re.compile("voting"))
     context.close()
 
 

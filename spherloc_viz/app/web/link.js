@@ -14,7 +14,7 @@
     if (!said) return;
     const address = `#${said.dataset.address}`;
     if (came) {
-      write(came);
+      if (location.hash.length <= 1) write(came);  // else the page was sent elsewhere meanwhile
       came = "";
     }
     if (session !== said.dataset.session) {
