@@ -83,6 +83,7 @@ def _certificate_lines(row: Row) -> list[str]:
     bad, known, level = row["dishonest"], row["proven_optimal"], row["proven_optimal_exact_gravity"]
     return [
         f"- upper bound below what brute force found: **{len(bad)}** of {row['problems']:,}"
+        + (f", {row['uncertain_gravity']:,} of these with uncertain gravity" if "uncertain_gravity" in row else "")
         + (f" (seeds {', '.join(map(str, bad[:20]))})" if bad else ""),
         f"- proven optimal: {100 * known:.1f} % ({100 * level:.1f} % where gravity is exact); "
         f"mean gap {row['mean_gap']:.2f}",
