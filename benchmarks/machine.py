@@ -19,6 +19,7 @@ PACKAGES = (
     "poselib",
     "pycolmap",
     "opencv-python-headless",
+    "pysuperansac",
     "networkit",
     "networkx",
 )

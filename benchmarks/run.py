@@ -36,6 +36,7 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help=f"the same as --problems {QUICK_PROBLEMS}")
     parser.add_argument("--fresh", action="store_true", help="measure rows again that are done")
     parser.add_argument("--list", action="store_true", help="name the rows and methods, and measure nothing")
+    parser.add_argument("--render", action="store_true", help="write table and pictures again, and measure nothing")
     parser.add_argument("--aria", type=Path, default=ARIA, metavar="FOLDER", help=f"real problems (default: {ARIA})")
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="default: benchmarks/results; build/benchmarks for trials"
@@ -87,6 +88,10 @@ class Results:
         self.rows[name] = {"case": name, "state": self.state, "size": size, "machine": describe(), **row}
         self.folder.mkdir(parents=True, exist_ok=True)
         _replace(self.path, json.dumps({"rows": list(self.rows.values())}, indent=1, ensure_ascii=False) + "\n")
+        self.write_table()
+
+    def write_table(self) -> None:
+        """The report of what is there."""
         _replace(self.folder / "table.md", markdown(list(self.rows.values())))
 
 
@@ -124,8 +129,14 @@ def run(chosen: argparse.Namespace) -> int:
         if unknown:
             print(f"no {kind} {', '.join(unknown)}: choose from {', '.join(known)}", file=sys.stderr)
             return 2
-    wanted = chosen.case or [*cases, *([] if chosen.method else others)]
     results = Results(chosen.out, fingerprint())
+    if chosen.render:
+        if not results.rows:
+            print(f"nothing was measured in {results.folder}", file=sys.stderr)
+            return 2
+        draw(results)
+        return 0
+    wanted = chosen.case or [*cases, *([] if chosen.method else others)]
     begin = time.monotonic()
     for name in wanted:
         if name in cases:
@@ -151,10 +162,11 @@ def run(chosen: argparse.Namespace) -> int:
 
 
 def draw(results: Results) -> None:
-    """The pictures of what is there."""
+    """The table and the pictures of what is there."""
     from benchmarks.pictures import draw_all
 
-    for path in (results.path, results.folder / "table.md", *draw_all(list(results.rows.values()), results.folder)):
+    results.write_table()
+    for path in (results.folder / "table.md", *draw_all(list(results.rows.values()), results.folder)):
         print(f"wrote {path}")
 
 
