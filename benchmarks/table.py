@@ -130,12 +130,18 @@ def _clique_lines(row: Row) -> list[str]:
 
 
 def _memory_lines(row: Row) -> list[str]:
-    if "skipped" in row:
-        return [f"skipped: {row['skipped']}"]
-    return [
-        f"{row['estimator']}, N={row['correspondences']}, 90 % outliers: peak {row['peak_mb']:,} MB, "
-        f"{row['growth_mb']:,} MB more than before the call, {row['time_ms'] / 1e3:.2f} s"
-    ]
+    return [_memory_line(run) for run in row.get("runs", [row])]
+
+
+def _memory_line(run: Row) -> str:
+    if "skipped" in run:
+        return f"- skipped: {run['skipped']}"
+    gap = run.get("gap")
+    proven = "" if gap is None else f", not proven: gap {gap}" if gap else ", proven"
+    return (
+        f"- {run['estimator']}, N={run['correspondences']:,}, 90 % outliers: peak {run['peak_mb']:,} MB, "
+        f"{run['growth_mb']:,} MB more than before the call, {run['time_ms'] / 1e3:.2f} s{proven}"
+    )
 
 
 def _machine_lines(rows: list[Row]) -> list[str]:
