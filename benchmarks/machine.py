@@ -33,6 +33,7 @@ MEASURING = (
     "memory.py",
     "methods.py",
     "peers.py",
+    "proven.py",
 )
 """The files here that decide what a row says; the others only show it."""
 

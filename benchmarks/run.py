@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks import certificate, clique, memory
+from benchmarks import certificate, clique, memory, proven
 from benchmarks.cases import Case, aria_cases, simulated_cases
 from benchmarks.machine import ROOT, describe, fingerprint, restart_on_one_core
 from benchmarks.measure import measure
@@ -56,6 +56,10 @@ def other_rows(problems: int | None) -> dict[str, tuple[str, Callable[[], Row]]]
     small = problems is not None
     checked = min(problems, 200) if problems is not None else 10_000
     return {
+        "proven": (
+            f"proven optimal, simulation with 0 to 97 % outliers and at least {proven.MIN_RIGHT} right matches",
+            lambda: proven.measure(max(proven.COUNTS.values()) if problems is None else problems),
+        ),
         "certificate": (
             f"certificate beside brute force, {checked:,} random problems with N <= {certificate.MAX_COUNT}",
             lambda: certificate.measure(checked),

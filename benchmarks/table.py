@@ -39,9 +39,13 @@ _HOW_TO_READ = (
 
 def case_lines(row: Row) -> list[str]:
     """A row as a Markdown table."""
-    return {"poses": _pose_lines, "certificate": _certificate_lines, "clique": _clique_lines, "memory": _memory_lines}[
-        row["kind"]
-    ](row)
+    return {
+        "poses": _pose_lines,
+        "proven": _proven_lines,
+        "certificate": _certificate_lines,
+        "clique": _clique_lines,
+        "memory": _memory_lines,
+    }[row["kind"]](row)
 
 
 _LATER = ("slowest ms", "largest gap")
@@ -96,6 +100,18 @@ def _pose_lines(row: Row) -> list[str]:
         if "median_inside_ms" in found
     ]
     return [*lines, "", f"Preparation of a problem for ours: {_short(row['preparation_ms'])} ms." + "".join(loops)]
+
+
+def _proven_lines(row: Row) -> list[str]:
+    lines = ["| N | outliers | proven | not proven at | largest gap |", "|" + 5 * "---|"]
+    for one in row["sizes"]:
+        rates = [f"{100 * rate:.0f} %" for rate in one["outlier_rates"]]
+        left = [f"{rate}: {n}" for rate, n in zip(rates, one["not_proven_by_rate"], strict=True) if n]
+        proven = f"{one['proven']:,} of {one['problems']:,}"
+        cells = (f"{one['correspondences']:,}", ", ".join(rates), proven, ", ".join(left), str(one["largest_gap"]))
+        lines.append("| " + " | ".join(cells) + " |")
+    proven, problems = (sum(one[key] for one in row["sizes"]) for key in ("proven", "problems"))
+    return [*lines, "", f"mc-exact, gravity exact: {proven:,} of {problems:,} proven, {100 * proven / problems:.2f} %"]
 
 
 def _certificate_lines(row: Row) -> list[str]:
