@@ -48,7 +48,8 @@ def random_problem(seed: int) -> tuple[Problem, float, str]:
         copies = rng.integers(0, count, (2, count // 3))
         points[copies[0]] = points[copies[1]]
         pixels[copies[0, ::2]] = pixels[copies[1, ::2]]
-    bound_rad = float(np.radians(rng.uniform(0.1, 5.0))) if rng.random() < 0.4 else 0.0
+    # Half of the problems have uncertain gravity.
+    bound_rad = float(np.radians(rng.uniform(0.1, 5.0))) if rng.random() < 0.5 else 0.0
     true_down = truth[:, :3] @ DOWN
     axis = tangent_basis(true_down[None])[0].T @ _unit(rng, 2)
     problem = Problem(
@@ -170,6 +171,7 @@ def summary(checks: list[Check]) -> dict[str, Any]:
         "proven_optimal_exact_gravity": float(
             np.mean([known for known, one in zip(proven, checks, strict=True) if not one.tilted])
         ),
+        "uncertain_gravity": sum(one.tilted for one in checks),
         "mean_gap": float(np.mean([one.upper_bound - one.lower_bound for one in checks])),
         "brute_force_found_more": sum(one.found > one.lower_bound for one in checks),
         "problems_by_kind": {kind: sum(one.kind == kind for one in checks) for kind in KINDS},

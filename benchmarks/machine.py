@@ -19,6 +19,7 @@ PACKAGES = (
     "poselib",
     "pycolmap",
     "opencv-python-headless",
+    "pysuperansac",
     "networkit",
     "networkx",
 )
@@ -32,6 +33,7 @@ MEASURING = (
     "memory.py",
     "methods.py",
     "peers.py",
+    "proven.py",
 )
 """The files here that decide what a row says; the others only show it."""
 

@@ -52,6 +52,7 @@ class Tally:
             "median_ms": _round(np.median(self.times_ms)),
             "quartiles_ms": [_round(value) for value in np.percentile(self.times_ms, (25, 75))],
             "p95_ms": _round(np.percentile(self.times_ms, 95)),
+            "slowest_ms": _round(max(self.times_ms)),
         }
         if right.any():
             summary["median_error_deg"] = _round(np.median(degrees[right]))
@@ -61,6 +62,7 @@ class Tally:
         if self.gaps:
             summary["proven_optimal"] = float(np.mean(np.array(self.gaps) <= 0))
             summary["mean_gap"] = float(np.mean(self.gaps))
+            summary["largest_gap"] = max(self.gaps)
         return summary
 
 

@@ -3,16 +3,27 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.machine import ROOT
+from spherloc.problem import Problem
 
 STATUS = Path("/proc/self/status")
 REPORTED = "memory: "
+TRUE_CAMERA = (30.0, 1.0, 0.0, 2.0)
+"""Yaw (deg) and position (m) where a problem is made of several."""
 
 
-def measure(correspondences: int, estimator: str = "mc-exact") -> dict[str, Any]:
+def measure(sizes: tuple[int, ...]) -> dict[str, Any]:
+    """One run for each number of correspondences, each in a process of its own."""
+    return {"runs": [_measured(size, "mc-exact") for size in sizes]}
+
+
+def _measured(correspondences: int, estimator: str) -> dict[str, Any]:
     """Peak resident memory, MB, and its growth over that of the warmed-up process, at 90 % outliers; or why not."""
     if not STATUS.is_file():
         return {"skipped": f"this system has no {STATUS}, which knows the peak of a process"}
@@ -30,13 +41,28 @@ def _status_mb(key: str) -> float:
     return float(line.split()[1]) / 1024.0
 
 
-def _run(correspondences: int, estimator: str) -> dict[str, Any]:
+def _problem(correspondences: int) -> Problem:
+    """Of the simulation at 90 % outliers; beyond what that draws at once, several clouds seen by the same camera."""
     from benchmarks.cases import simulated
+    from spherloc.datasets.synthetic import MAX_CORRESPONDENCES
+
+    if correspondences <= MAX_CORRESPONDENCES:
+        return simulated(correspondences, 0.9)(0)
+    draw = simulated(MAX_CORRESPONDENCES, 0.9, true_camera=TRUE_CAMERA)
+    parts = [draw(seed) for seed in range(-(-correspondences // MAX_CORRESPONDENCES))]
+    joined = {
+        name: np.concatenate([getattr(part, name) for part in parts])[:correspondences]
+        for name in ("pixels", "points", "truth_inliers")
+    }
+    return replace(parts[0], **joined)
+
+
+def _run(correspondences: int, estimator: str) -> dict[str, Any]:
     from spherloc.estimators import estimate
     from spherloc.warm_up import warm_up
 
     warm_up()
-    problem = simulated(correspondences, 0.9)(0)
+    problem = _problem(correspondences)
     before = _status_mb("VmRSS")
     trace = estimate(problem, estimator)
     peak = _status_mb("VmHWM")
@@ -46,6 +72,7 @@ def _run(correspondences: int, estimator: str) -> dict[str, Any]:
         "peak_mb": round(peak),
         "growth_mb": round(peak - before),
         "time_ms": round(trace.timings_ms["total"], 1),
+        "gap": None if trace.certificate is None else trace.certificate.gap,
     }
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks import certificate, clique, memory
+from benchmarks import certificate, clique, memory, proven
 from benchmarks.cases import Case, aria_cases, simulated_cases
 from benchmarks.machine import ROOT, describe, fingerprint, restart_on_one_core
 from benchmarks.measure import measure
@@ -36,6 +36,7 @@ def arguments(argv: list[str]) -> argparse.Namespace:
     parser.add_argument("--quick", action="store_true", help=f"the same as --problems {QUICK_PROBLEMS}")
     parser.add_argument("--fresh", action="store_true", help="measure rows again that are done")
     parser.add_argument("--list", action="store_true", help="name the rows and methods, and measure nothing")
+    parser.add_argument("--render", action="store_true", help="write table and pictures again, and measure nothing")
     parser.add_argument("--aria", type=Path, default=ARIA, metavar="FOLDER", help=f"real problems (default: {ARIA})")
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER", help="default: benchmarks/results; build/benchmarks for trials"
@@ -55,6 +56,10 @@ def other_rows(problems: int | None) -> dict[str, tuple[str, Callable[[], Row]]]
     small = problems is not None
     checked = min(problems, 200) if problems is not None else 10_000
     return {
+        "proven": (
+            f"proven optimal, simulation with 0 to 97 % outliers and at least {proven.MIN_RIGHT} right matches",
+            lambda: proven.measure(max(proven.COUNTS.values()) if problems is None else problems),
+        ),
         "certificate": (
             f"certificate beside brute force, {checked:,} random problems with N <= {certificate.MAX_COUNT}",
             lambda: certificate.measure(checked),
@@ -63,7 +68,7 @@ def other_rows(problems: int | None) -> dict[str, tuple[str, Callable[[], Row]]]
             "maximum clique of ball-overlap graphs",
             lambda: clique.measure(clique.GRAPHS[:2] if small else clique.GRAPHS, 2 if small else 5),
         ),
-        "memory": ("memory of mc-exact", lambda: memory.measure(500 if small else 5000)),
+        "memory": ("memory of mc-exact", lambda: memory.measure((500,) if small else (5000, 100_000))),
     }
 
 
@@ -87,6 +92,10 @@ class Results:
         self.rows[name] = {"case": name, "state": self.state, "size": size, "machine": describe(), **row}
         self.folder.mkdir(parents=True, exist_ok=True)
         _replace(self.path, json.dumps({"rows": list(self.rows.values())}, indent=1, ensure_ascii=False) + "\n")
+        self.write_table()
+
+    def write_table(self) -> None:
+        """The report of what is there."""
         _replace(self.folder / "table.md", markdown(list(self.rows.values())))
 
 
@@ -124,8 +133,14 @@ def run(chosen: argparse.Namespace) -> int:
         if unknown:
             print(f"no {kind} {', '.join(unknown)}: choose from {', '.join(known)}", file=sys.stderr)
             return 2
-    wanted = chosen.case or [*cases, *([] if chosen.method else others)]
     results = Results(chosen.out, fingerprint())
+    if chosen.render:
+        if not results.rows:
+            print(f"nothing was measured in {results.folder}", file=sys.stderr)
+            return 2
+        draw(results)
+        return 0
+    wanted = chosen.case or [*cases, *([] if chosen.method else others)]
     begin = time.monotonic()
     for name in wanted:
         if name in cases:
@@ -151,10 +166,11 @@ def run(chosen: argparse.Namespace) -> int:
 
 
 def draw(results: Results) -> None:
-    """The pictures of what is there."""
+    """The table and the pictures of what is there."""
     from benchmarks.pictures import draw_all
 
-    for path in (results.path, results.folder / "table.md", *draw_all(list(results.rows.values()), results.folder)):
+    results.write_table()
+    for path in (results.folder / "table.md", *draw_all(list(results.rows.values()), results.folder)):
         print(f"wrote {path}")
 
 

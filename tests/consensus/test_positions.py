@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.certificate import check
+from spherloc.bounds import bounds_of
 from spherloc.consensus import positions
 from spherloc.consensus.pair_arcs import CIRCLE, pair_arcs, turn_of
 from spherloc.consensus.pose_cells import (
@@ -22,7 +23,7 @@ from spherloc.consensus.pose_search import CUT_BINS, FORM, cut_cell, sort_matche
 from spherloc.consensus.positions import search_positions
 from spherloc.consensus.stabbing import EVERYWHERE, deepest, keep_possible, scratch_for
 from spherloc.geometry import pose
-from spherloc.refine import residuals_px
+from spherloc.refine import inlier_counts, residuals_px
 from spherloc.watch import working_s
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -61,6 +62,24 @@ def test_every_pose_is_in_one_of_the_charts(rng, scene_of):
     assert seen == set(range(CHARTS))
 
 
+def random_cell(rng, seed, matches, truth, bound_rad):
+    """Chart, ends (6,) each, and the pose's parameters (6,) that it lies around: a third anywhere, others the truth."""
+    chart, at = parameters_of(matches, truth)
+    at[4:] = np.clip(at[4:], -bound_rad / 2, bound_rad / 2)
+    if seed % 3 == 0:  # any cell; the others are around a pose that explains much
+        chart = int(rng.integers(CHARTS))
+        domain = whole_domain(bound_rad)
+        at = rng.uniform(domain[0][chart], domain[1][chart])
+    half = 10.0 ** rng.uniform(-4.0, -0.3, AXES)
+    half[4:] = np.minimum(half[4:], bound_rad) if bound_rad else 0.0
+    middle = at + rng.uniform(-1, 1, AXES) * half
+    lower, upper = middle - half, middle + half
+    if chart:
+        lower[(chart - 1) // 2] = max(lower[(chart - 1) // 2], 1e-6)
+        upper[(chart - 1) // 2] = max(upper[(chart - 1) // 2], 2e-6)
+    return chart, lower, upper, at
+
+
 @pytest.mark.parametrize("bound_rad", [0.0, TILT_RAD])
 def test_many_poses_obey_the_bounds_of_their_cells(rng, scene_of, bound_rad):
     """What a cell excludes no pose of it explains, what it is sure of each explains, yaws are in their intervals."""
@@ -68,19 +87,7 @@ def test_many_poses_obey_the_bounds_of_their_cells(rng, scene_of, bound_rad):
     for seed in range(48):
         aligned, truth = tilted(scene_of, seed % 12, bound_rad)
         matches, count = pack_matches(aligned, BOUND_PX), len(aligned.points)
-        chart, at = parameters_of(matches, truth)
-        at[4:] = np.clip(at[4:], -bound_rad / 2, bound_rad / 2)
-        if seed % 3 == 0:  # any cell; the others are around a pose that explains much
-            chart = int(rng.integers(CHARTS))
-            domain = whole_domain(bound_rad)
-            at = rng.uniform(domain[0][chart], domain[1][chart])
-        half = 10.0 ** rng.uniform(-4.0, -0.3, AXES)
-        half[4:] = np.minimum(half[4:], bound_rad) if bound_rad else 0.0
-        middle = at + rng.uniform(-1, 1, AXES) * half
-        lower, upper = middle - half, middle + half
-        if chart:
-            lower[(chart - 1) // 2] = max(lower[(chart - 1) // 2], 1e-6)
-            upper[(chart - 1) // 2] = max(upper[(chart - 1) // 2], 2e-6)
+        chart, lower, upper, at = random_cell(rng, seed, matches, truth, bound_rad)
         cell, reach, spread, kept = np.empty(16), np.empty(6), np.empty(2), np.empty(count, np.int32)
         place_cell(chart, lower, upper, cell)
         everybody = np.arange(count, dtype=np.int32)
@@ -122,6 +129,60 @@ def test_many_poses_obey_the_bounds_of_their_cells(rng, scene_of, bound_rad):
     assert checked >= 140_000 and decided >= 140 and cut >= 5 and better >= 50, (cut, better)
 
 
+def most_of_cell(matches, chart, lower, upper):
+    """What no pose of a cell exceeds: the smaller of the bounds by derivatives and by intervals of yaw."""
+    count = len(matches.rows)
+    everybody, kept, scratch = np.arange(count, dtype=np.int32), np.empty(count, np.int32), scratch_for(count)
+    cell, axis = np.empty(16), (chart - 1) // 2 if chart else -1
+    place_cell(chart, lower, upper, cell)
+    sure, undecided, _ = sort_matches(matches, cell, axis, everybody, kept, np.empty((count, FORM)), -1, np.empty(6))
+    many, free = keep_possible(matches, cell, everybody, kept, scratch, -1, np.empty(2))
+    return min(sure + undecided, deepest(scratch, many, free, -1, np.full(256, count, np.int32)))
+
+
+def poses_of(matches, chart, at):
+    """``pose_of`` of many parameters (K, 6): poses (K, 3, 4)."""
+    (cy, ca, cc), (sy, sa, sc) = np.cos(at[:, 3:].T), np.sin(at[:, 3:].T)
+    turns = np.empty((len(at), 3, 3))
+    turns[:, 0] = np.column_stack([cc * cy, -sc, cc * sy])
+    turns[:, 1] = np.column_stack([ca * sc * cy + sa * sy, ca * cc, ca * sc * sy - sa * cy])
+    turns[:, 2] = np.column_stack([sa * sc * cy - ca * sy, sa * cc, sa * sc * sy + ca * cy])
+    c, scale = at[:, :3].copy(), np.ones(len(at))
+    if chart:
+        axis = (chart - 1) // 2
+        scale, c[:, axis] = at[:, axis], 1.0 if chart % 2 else -1.0
+    centres = matches.middle + matches.scale * c / scale[:, None]
+    return np.concatenate([turns, -turns @ centres[:, :, None]], axis=2)
+
+
+@pytest.mark.parametrize("bound_rad", [0.0, TILT_RAD])
+def test_no_pose_explains_more_than_its_cell_allows(rng, scene_of, bound_rad):
+    """Over a million random poses in all, with exact and with uncertain gravity: in the middle, at corners, and near a
+    pose that explains much."""
+    problems = [tilted(scene_of, seed, bound_rad) for seed in range(12)]
+    packed = [pack_matches(aligned, BOUND_PX) for aligned, _ in problems]
+    checked = seed = telling = reached = 0
+    while checked < 510_000:
+        (aligned, truth), matches = problems[seed % 12], packed[seed % 12]
+        chart, lower, upper, at = random_cell(rng, seed, matches, truth, bound_rad)
+        inside = lower + rng.uniform(0, 1, (1000, AXES)) * (upper - lower)
+        inside[::4] = np.where(rng.random((250, AXES)) < 0.5, lower, upper)
+        near = at + 10.0 ** rng.uniform(-4, 0, (500, 1)) * (inside[::2] - at)
+        inside[1::2] = np.clip(near, lower, upper)
+        # A cell's bounds are about poses within the gravity bound.
+        inside = inside[np.cos(inside[:, 4]) * np.cos(inside[:, 5]) >= matches.least_cosine]
+        if len(inside):
+            poses = poses_of(matches, chart, inside)
+            np.testing.assert_allclose(poses[0], pose_of(matches, chart, inside[0]), rtol=1e-12, atol=1e-12)
+            explained = inlier_counts(aligned, poses, BOUND_PX)
+            most = most_of_cell(matches, chart, lower, upper)
+            assert explained.max() <= most
+            telling += most < len(aligned.points)
+            reached += 1 < explained.max() == most
+        checked, seed = checked + len(inside), seed + 1
+    assert telling >= 0.5 * seed and reached >= 50, (telling, reached, seed)
+
+
 @pytest.mark.parametrize("seed", [0, 3, 9, 13, 17, 19, 26, 30, 31, 33, 36, 44])
 def test_against_brute_force(seed):
     """Exact and uncertain gravity, seven kinds of geometry: nothing beats what is proven."""
@@ -148,12 +209,13 @@ def everything(aligned, start=None, effort=10**9):
     return search_positions(aligned, pack_matches(aligned, BOUND_PX), start, effort, working_s() + 600.0)
 
 
-def test_no_larger_than_the_largest_clique_of_pairs(scene_of):
-    """What one pose explains agrees in pairs, wherever the camera is."""
-    for seed in range(6):
-        aligned, _ = tilted(scene_of, seed, 0.0, correspondences=30, outlier_rate=0.8)
+@pytest.mark.parametrize(("bound_rad", "size", "rate"), [(0.0, 30, 0.8), (0.005, 10, 0.6)])
+def test_no_larger_than_the_largest_clique_of_pairs(scene_of, bound_rad, size, rate):
+    """What one pose explains agrees in pairs, wherever the camera is and however it is tilted."""
+    for seed in range(20):
+        aligned, _ = tilted(scene_of, seed, bound_rad, correspondences=size, outlier_rate=rate)
         found = everything(aligned)
-        pairs, _, _ = pair_arcs(aligned, np.arcsin(BOUND_PX * aligned.radians_per_pixel))
+        pairs, _, _ = pair_arcs(aligned, bounds_of(aligned, BOUND_PX).radians)
         largest = max(len(clique) for clique in nx.find_cliques(nx.Graph(pairs.tolist())))
         assert found.finished and found.support <= largest
         assert np.count_nonzero(residuals_px(aligned, found.pose) <= BOUND_PX) == found.support

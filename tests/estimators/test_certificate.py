@@ -9,11 +9,13 @@ from small_problems import explained, good_poses, level_poses
 
 from spherloc.bounds import bounds_of
 from spherloc.consensus.chance import chance_rate, nfa
+from spherloc.datasets import load_scene
 from spherloc.estimators import estimate, options_type
 from spherloc.geometry import pose, rotation_angle, so3_exp, yaw_of, yaw_rotation
 from spherloc.problem import Problem
 from spherloc.refine import residuals_px
 from spherloc.trace import ConsensusStage
+from tests.needs import real_data
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -141,3 +143,18 @@ def test_only_outliers_are_called_chance(scene_of):
     for seed in range(3):
         trace = solve(scene_of("panorama", outlier_rate=1.0).problem(seed), seed=seed)
         assert trace.certificate.nfa > 1e-3
+
+
+@pytest.mark.parametrize(("folder", "scenes"), [("aria_adt_fisheye", 3), ("aria_gen2", 12)])
+def test_real_images_true_pose_never_explains_more(folder, scenes):
+    """No less is found than it explains, even by a twentieth of the usual effort, with which not all is proven."""
+    options = Options(bound_px=3.0, effort=0.05)
+    counts = []
+    for path in sorted(real_data(folder).glob("*.toml")):
+        problem = load_scene(path).problem()
+        assert problem.truth_cam_from_map is not None
+        aligned, truth = problem.aligned, problem.aligned.align_pose(problem.truth_cam_from_map)
+        assert tilt_of(truth[:, :3]) <= aligned.gravity_bound_rad + 1e-9
+        of_truth = np.count_nonzero(residuals_px(aligned, truth) <= options.bound_px)
+        counts.append((of_truth, solve(problem, options).certificate.lower_bound))
+    assert len(counts) == scenes and all(of_truth <= found for of_truth, found in counts), counts
