@@ -192,9 +192,6 @@ def test_words_move_and_change_in_place(painter: Painter, canvas: Canvas) -> Non
     painter.draw([Label("scale/length", "scale bar", np.ones(3), "2 m")], ALL)
     node = canvas.nodes["/scale/length"]
     assert canvas.added == ["/scale/length"] and node.text == "2 m" and np.all(node.position == 1.0)
-    assert canvas.calls["/scale/length"][1]["font_size_mode"] == "screen"
-    painter.draw([Label("scale/length", "scale bar", np.ones(3), "2 m", 0.3)], ALL)
-    assert canvas.calls["/scale/length"][1]["font_size_mode"] == "scene"
     painter.draw([Label("scale/length", "scale bar", np.ones(3), "")], ALL)
     assert not canvas.shown
 

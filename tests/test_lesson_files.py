@@ -85,6 +85,8 @@ def test_the_answers_of_a_hand_out_are_those_of_the_run_after_the_right_answer()
     told = re.search(r"with the answer that you chose, is <b>([^<]*)</b>", answers)
     assert told is not None and told[1] == "a success"
     assert "<figure" in answers[told.start() - 300_000 : told.start()]
+    answers = handout_of(lesson_named("ransac")).split("<h2>Answers</h2>")[1]
+    assert re.search(r"With <b>80 %</b> wrong matches.{0,900}<b>170</b></strong> samples", answers, re.DOTALL)
 
 
 def test_on_paper_the_camera_is_drawn_over_the_balls_around_it() -> None:

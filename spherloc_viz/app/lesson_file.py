@@ -41,6 +41,7 @@ from spherloc_viz.lessons.html import (
     has_images,
     links_in,
     names_in,
+    right_changes,
     setting_text,
     settings_in,
 )
@@ -141,9 +142,8 @@ def handout_of(lesson: Lesson) -> str:
 
     sheets = []
     for moment in lesson.moments:
-        right = "" if moment.question is None else next(one.go for one in moment.question.answers if one.right)
-        shown, asked = (told(changed_state(moment.state, changes)) for changes in (right, moment.before))
-        sheets.append(Sheet(*shown, *asked))
+        answered, asked = (changed_state(moment.state, changes) for changes in (right_changes(moment), moment.before))
+        sheets.append(Sheet(*told(answered), *told(asked)))
     return handout_page(lesson, sheets, lambda state: _as_data(images_of(runs, state)))
 
 

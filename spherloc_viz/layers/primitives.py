@@ -112,13 +112,11 @@ class Textured(Primitive):
 
 @dataclass(frozen=True, eq=False)
 class Label(Primitive):
-    """A text at a position."""
+    """A text at a position, which keeps its size on the screen."""
 
     position: FloatArray
     """(3,) position of its middle, metres."""
     text: str
-    height_m: float | None = None
-    """Height of its letters, metres, so that it shrinks with distance; None keeps its size on the screen."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "text", true_minus(self.text))

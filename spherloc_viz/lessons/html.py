@@ -288,6 +288,11 @@ class Sheet:
     """The scene until then."""
 
 
+def right_changes(moment: Moment) -> str:
+    """What the right answer of a moment changes of its state; empty without a question."""
+    return "" if moment.question is None else next(one.go for one in moment.question.answers if one.right)
+
+
 def handout_page(lesson: Lesson, sheets: Collection[Sheet], images: Callable[[str], str]) -> str:
     """A lesson to be printed. What is told once a question is answered stands with the answers, on the last pages;
     ``images`` is as in ``Form``."""
@@ -297,14 +302,15 @@ def handout_page(lesson: Lesson, sheets: Collection[Sheet], images: Callable[[st
         form, told = printed(sheet.asked_numbers, images), printed(sheet.numbers, images)
         parts.append(f"<section><h2>{place}. {title}</h2>{_figure(sheet.asked_picture, title)}")
         parts.append(prose_html(moment.prose, state, form))
-        after = prose_html(moment.after, state, told)
+        answered = changed_state(state, right_changes(moment))
+        after = prose_html(moment.after, answered, told)
         if question is not None:
             answers = "".join(f"<li>☐ {_inline(answer.text, state, form)}</li>" for answer in question.answers)
             asked = prose_html(question.ask, state, form)
             parts.append(f'<div class="question">{asked}<ol class="answers">{answers}</ol></div>')
             told_why = "".join(
                 f"<li>{'✓' if answer.right else '✗'} <b>{_inline(answer.text, state, told)}.</b> "
-                f"{_inline(answer.shows, state, told)}</li>"
+                f"{_inline(answer.shows, answered, told)}</li>"
                 for answer in question.answers
             )
             figure = _figure(sheet.picture, title) if sheet.picture != sheet.asked_picture else ""

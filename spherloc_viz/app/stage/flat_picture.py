@@ -16,8 +16,6 @@ MIN_DOT_PX, MAX_DOT_PX = 1.2, 12.0
 LINE = 0.6
 """Width of lines relative to that on the screen, where the canvas is larger."""
 LABEL_PX = 11.0
-MIN_LETTER_PX = 6.0
-"""Least size of a label whose size depends on its distance; smaller ones are left out."""
 LETTER = 0.55
 """Average width of a letter as a share of the height of its line."""
 NEAR_M = 1e-3
@@ -86,8 +84,7 @@ def _shapes(item: SceneItem, eye: _Eye) -> Iterator[Shape]:
             yield from _outline(eye, item)
         case Label():
             depth = float(eye.depths_m(item.position[None])[0])
-            height = np.array([np.inf if item.height_m is None else item.height_m])
-            if depth > NEAR_M and eye.sizes_px(height, np.array([depth]))[0] >= MIN_LETTER_PX:
+            if depth > NEAR_M:
                 ((x, y),) = eye.pixels(item.position[None])
                 if 0 < x < WIDTH and 0 < y < HEIGHT:
                     half = min(0.5 * LETTER * LABEL_PX * len(item.text), 0.5 * WIDTH)

@@ -285,7 +285,7 @@ def _look(item: SceneItem) -> tuple:
         case Segments():
             extra = (item.width_px,)
         case Label():
-            extra = (item.height_m is None,)
+            extra = ()
         case Textured():
             extra = (item.key,)
     return (type(item), _size(item), *extra)
@@ -303,7 +303,7 @@ _SHOWN: dict[type[SceneItem], tuple[str, ...]] = {
     Balls: ("centers", "radii_m", "colors"),
     Mesh: ("vertices", "faces"),
     Textured: ("map_from_mesh",),
-    Label: ("position", "text", "height_m"),
+    Label: ("position", "text"),
 }
 """Fields of an item that a node can follow without being added again."""
 
@@ -328,8 +328,7 @@ def _changing(item: SceneItem) -> dict[str, Any]:
             wxyz = vtf.SO3.from_matrix(turn / scale).wxyz
             return {"wxyz": wxyz, "position": item.map_from_mesh[:, 3], "scale": scale}
         case Label():
-            height = {} if item.height_m is None else {"font_scene_height": item.height_m}
-            return {"text": item.text, "position": item.position, **height}
+            return {"text": item.text, "position": item.position}
 
 
 def _round(item: Points) -> bool:
@@ -382,10 +381,7 @@ def _add(scene: viser.SceneApi, item: SceneItem, glb: bytes | None, label_scale:
             assert glb is not None
             return scene.add_glb(name, glb, cast_shadow=False, receive_shadow=False, **props)
         case Label():
-            mode = "screen" if item.height_m is None else "scene"
-            return scene.add_label(
-                name, font_size_mode=mode, font_screen_scale=label_scale, anchor="center-center", **props
-            )
+            return scene.add_label(name, font_screen_scale=label_scale, anchor="center-center", **props)
 
 
 def _add_batch(

@@ -165,7 +165,7 @@ def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: 
 
 def cut(picture: Picture, view: View, aspect: float, letter: float) -> frozenset[str]:
     """Names of the labels that the edge of the canvas would cut, or that would cover more important ones."""
-    labels = [item for item in picture.scene if isinstance(item, Label) and item.height_m is None]
+    labels = [item for item in picture.scene if isinstance(item, Label)]
     if not labels:
         return frozenset()
     labels.sort(key=lambda label: label.layer in BESIDE)
@@ -184,7 +184,7 @@ def _names(picture: Picture, subject: FloatArray) -> list[Label]:
     """The labels beside a subject (K, 3)."""
     low, high = np.min(subject, axis=0), np.max(subject, axis=0)
     room = NEAR * float(np.max(high - low))
-    labels = [item for item in picture.scene if isinstance(item, Label) and item.height_m is None]
+    labels = [item for item in picture.scene if isinstance(item, Label)]
     own = [label for label in labels if label.layer not in BESIDE]
     return [label for label in own if np.all((label.position > low - room) & (label.position < high + room))]
 
