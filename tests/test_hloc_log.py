@@ -51,8 +51,9 @@ trees = st.recursive(
 @given(trees, st.integers(0, 5))
 def test_data_come_back_as_they_were(tree: Any, protocol: int) -> None:
     # Before protocol 3 bytes are a call, which is noted and not made.
-    if protocol >= 3 or b"_codecs" not in pickle.dumps(tree, protocol):
-        assert plain(read_pickle_data(pickle.dumps(tree, protocol))) == tree
+    written = pickle.dumps(tree, protocol)
+    if protocol >= 3 or not any(module in written for module in (b"_codecs", b"__builtin__")):
+        assert plain(read_pickle_data(written)) == tree
 
 
 @pytest.mark.parametrize("protocol", range(3, 6))
