@@ -90,7 +90,7 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
     run, best, second = (0 if fit is None else fit.support(bound) for fit in (e.run, e.best, other))
     match cause:
         case Cause.OK:
-            return f"{run} of {total} matches agree within {bound:.3g} px, {_compared(e, run)}."
+            return f"{run} of {total} matches agree within {bound:.3g} px, {_compared(e, truth, run)}."
         case Cause.TOO_FEW_INLIERS if truth is not None:
             return f"Only {np.count_nonzero(truth.right)} of {total} matches are right, no more than chance gives."
         case Cause.TOO_FEW_INLIERS:
@@ -114,8 +114,10 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
     return _measured_summary(e, truth, cause, unit)
 
 
-def _compared(e: Evidence, run: int) -> str:
+def _compared(e: Evidence, truth: Truth | None, run: int) -> str:
     """What other poses have where a run is right with so many matches; the truth can say so although one has more."""
+    if truth is None:
+        return "and no other pose comes near"
     best, other = (0 if fit is None else fit.support(e.bound_px) for fit in (e.best, e.alternative))
     if run < MISSED * best:
         return f"and the pose is right, though a longer search finds one that {best} agree with"

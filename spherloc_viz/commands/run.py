@@ -266,7 +266,7 @@ def as_text(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | No
         # Only now: the layers take half a second.
         from spherloc_viz.layers.outcome import chance, proof, warning
 
-        proven = proof(trace.certificate, count_within_noise(trace))
+        proven = proof(trace.certificate, explained)
         lines.append(f"  {proven}; NFA (expected number of false sets of this size): {chance(trace.certificate)}")
         lines += [f"  {sentence}" for sentence in (warning(trace.certificate),) if sentence]
     if diagnosis.doubtful:
