@@ -7,6 +7,8 @@ import numpy as np
 
 from spherloc.diagnosis.causes import Cause, Diagnosis
 from spherloc.diagnosis.evidence import (
+    MISSED,
+    STRONG,
     WIDER,
     Evidence,
     Fit,
@@ -17,7 +19,7 @@ from spherloc.diagnosis.evidence import (
     gather_truth,
     measures_of,
 )
-from spherloc.diagnosis.words import MISSED, STRONG, describe
+from spherloc.diagnosis.words import describe
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.trace import RansacStage, Trace
 

@@ -89,6 +89,10 @@ MAX_WORK = 20_000_000
 CONFIDENCE = 0.9999
 MAX_TILT_RAD = np.radians(12.0)
 """Largest gravity error that is searched for."""
+MISSED = 0.85
+"""A run has missed the best pose if its own has less than this share of the best one's support."""
+STRONG = 0.45
+"""A second pose with at least this share of the best one's support is not chance: structure repeats itself."""
 WIDER = 4.0
 """Largest factor of the noise bound that is tried if the bound may be too small."""
 MAX_CERTIFIED = 500

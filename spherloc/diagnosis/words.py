@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from spherloc.diagnosis.causes import Cause, Diagnosis
-from spherloc.diagnosis.evidence import Evidence, Fit, Truth, apart, different
+from spherloc.diagnosis.evidence import MISSED, STRONG, Evidence, Fit, Truth, apart, different
 from spherloc.metrics import evaluate
 from spherloc.trace import Certificate, ConsensusStage, RansacStage, Trace
 
@@ -41,10 +41,6 @@ def describe(
     )
 
 
-MISSED = 0.85
-"""A run has missed the best pose if its own has less than this share of the best one's support."""
-STRONG = 0.45
-"""A second pose with at least this share of the best one's support is not chance: structure repeats itself."""
 FAR = 3.0
 """Number of noise bounds beyond which the errors of most right matches are not noise."""
 
