@@ -4,7 +4,7 @@ import json
 from base64 import b64encode
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from html import escape
 from pathlib import Path
 
@@ -136,6 +136,7 @@ def handout_of(lesson: Lesson) -> str:
     """A lesson as HTML to be printed; its pictures are inside."""
     runs = LinkedRuns()
 
+    @cache
     def told(state: str) -> tuple[dict[str, str], str]:
         linked = runs.run(state)
         return numbers_text(linked), svg(still_of(linked, runs, dark=False))
