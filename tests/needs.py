@@ -74,6 +74,7 @@ NEEDS = {
     "formats_real": _data("formats_real", "the real calibrations"),
     "kapture_t265": _data("kapture_t265", "the real stereo fisheyes"),
     "stella_equirect_pair": _data("stella_equirect_pair", "the real panoramas"),
+    "pano_vertical_pairs": _data("pano_vertical_pairs", "the real pairs of panoramas"),
     "opencv 5": Need(lambda: hasattr(cv2, "ALIKED_create"), "this OpenCV has no learned features (OpenCV 5 has)"),
     "weights": _data("weights", "trained weights of learned features"),
     "learned": Need(trained.installed, "the extra 'learned' is not installed (it takes 5 GB)"),
@@ -105,8 +106,9 @@ def lacking() -> dict[str, str]:
 def require(*names: str) -> None:
     """Skip the test, or at the top of a file all of its tests, unless everything named is here."""
     for name in names:
+        lack = NEEDS[name].lack
         if name in lacking():
-            pytest.skip(NEEDS[name].lack, allow_module_level=True)
+            pytest.skip(lack, allow_module_level=True)
 
 
 def needs(name: str) -> pytest.MarkDecorator:
