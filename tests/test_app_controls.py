@@ -1,6 +1,7 @@
 """Controls say what they show, and show what they are told: without a browser."""
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -268,6 +269,16 @@ def test_estimator_controls_show_what_they_are_told(server: viser.ViserServer) -
         assert [other for other, folder in controls._folders.items() if folder.visible] == [name]
     with pytest.raises(InputError, match="unknown estimator 'magic': choose one of"):
         controls.write("magic", None)
+
+
+def test_an_estimator_that_comes_with_another_bound_says_so(server: viser.ViserServer) -> None:
+    controls = EstimatorControls(server.gui, lambda event: None)
+    said = []
+    for name in ("mc", "mc-exact", "ransac-2p", "mc"):
+        controls.write(name, options_type(name)())
+        said.append(re.sub("<[^>]*>", "", controls._remark.content))
+    assert said[:2] == ["", ""]
+    assert "now 8 px, not 3 px" in said[2] and "now 3 px, not 8 px" in said[3]
 
 
 def test_a_typed_number_that_no_solver_can_reckon_with_is_refused(server: viser.ViserServer) -> None:

