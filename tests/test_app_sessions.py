@@ -339,6 +339,39 @@ def test_only_views_that_are_seen_are_drawn(house: House) -> None:
     until(lambda: "select-bin" in residuals.content)
 
 
+def test_a_tab_is_chosen_only_by_whoever_has_seen_the_step(house: House) -> None:
+    """A page under load opens the view of a step long after it got the step."""
+    _, session = house.visit()
+    panels = session._display.panels
+
+    def see(argument: str) -> str:
+        session._touches.deliver(Touch("views", argument, 0.0, 0.0, 0.0, 0.0, False))
+        return panels.tab
+
+    assert panels._of_step == "Residuals"
+    assert see("Yaw;;") == see("Yaw;Yaw;") == "step's", "not opened yet"
+    assert see("Residuals;Residuals;") == "step's"
+    assert see("Yaw;Residuals;") == "Yaw", "a person opened it"
+    panels.open_tab("Matches")
+    assert see("Yaw;Residuals;") == "Matches", "the page has yet to follow the link"
+    assert see("Matches;Residuals;Matches 1") == "Matches"
+    assert see("Residuals;Residuals;Matches 1") == "step's"
+
+
+def test_a_link_counts_as_followed_when_its_step_is_drawn(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, session = house.visit()
+    gate, draw = threading.Event(), session._display.draw
+    monkeypatch.setattr(session._display, "draw", lambda *words: draw(*words) if gate.wait(LIMIT_S) else None)
+    session._touches.deliver(Touch("link", "v=1&step=bearings", 0.0, 0.0, 0.0, 0.0, False))
+    until(lambda: session._followed == 1)
+    assert session._run is not None
+    session._write_address(session._run)
+    assert "step=outcome" in session._address.content and 'data-followed="0"' in session._address.content
+    gate.set()
+    until(lambda: 'data-followed="1"' in session._address.content)
+    assert "step=bearings" in session._address.content
+
+
 def test_matches_are_selected_and_changed_by_hand(house: House) -> None:
     _, session = house.visit()
 

@@ -54,6 +54,7 @@ class LeftPanels:
             gui.add_html(glossary_html())
             self._card = gui.add_html("")
         self._opening = self._of_step = self._asked = ""
+        self._tab = TABS[0]
         self._seen, self._changed = frozenset({"Yaw"}), changed
         touches.on("views", self._see)
         with _view(gui, views, "Yaw"):
@@ -123,12 +124,12 @@ class LeftPanels:
 
     @property
     def tab(self) -> str:
-        """The view that a person has brought to the front, for the page's link."""
-        shown = [] if self._of_step in self._seen else [name for name in TABS[1:] if name in self._seen]
-        return shown[0] if shown else TABS[0]
+        """The view that a person or a link has brought to the front, for the page's link."""
+        return self._tab
 
     def open_tab(self, tab: str) -> None:
         """Bring a view to the front, once: then it is the person's to choose."""
+        self._tab = tab
         if tab != TABS[0]:
             self._asked = f"{tab} {1 + int(self._asked.partition(' ')[2] or 0)}"
 
@@ -149,8 +150,13 @@ class LeftPanels:
             self._changed(None)
 
     def _see(self, touch: Touch) -> None:
-        """The page reports which views can be seen now."""
-        self._seen = frozenset(touch.argument.split(","))
+        """The page reports which views can be seen now, and which step's view and which link's it has opened by now: as
+        long as these are older ones, what is seen is nobody's choice."""
+        seen, of_step, asked = (touch.argument + ";;").split(";")[:3]
+        self._seen = frozenset(seen.split(","))
+        if (of_step, asked) == (self._of_step, self._asked):
+            chosen = [] if of_step in self._seen else [name for name in TABS[1:] if name in self._seen]
+            self._tab = chosen[0] if chosen else TABS[0]
         self._changed(None)
 
     def _widen(self, touch: Touch) -> None:

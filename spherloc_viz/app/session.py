@@ -85,7 +85,9 @@ class Session:
         self._links: deque[tuple[int, str]] = deque()
         """Links that are still to be followed; before each stands the number of the change that came before it."""
         self._followed = 0
-        """How many links were followed."""
+        """How many links were followed, ..."""
+        self._arrived = 0
+        """... and of how many the page shows the step."""
         self._in_lesson = False
         self._numbers: tuple[Trace, dict[str, str]] | None = None
         """The numbers of a run as text, for the lesson that shows this page in a frame."""
@@ -440,13 +442,14 @@ class Session:
 
     def _show(self, asked: bool) -> float | None:
         """The page thread's job: show the step at hand of the newest run."""
-        answers, run = self._answers, self._run
+        answers, followed, run = self._answers, self._followed, self._run
         if run is None:
             self._display.draw_map()
             return None
         diagnosis = self._diagnosis(run)
         self._services.presented.hide(run, self._display.withheld(run))
         pause = self._display.draw(run, self._mesh(run), diagnosis, self._edits.places(run.kept), asked, answers)
+        self._arrived = followed
         if self._in_lesson:
             self._write_address(run)
         self._viewer.ask()
@@ -459,7 +462,7 @@ class Session:
         opened = self._controls.review.opened
         recording = opened.recorded.row.file if opened is not None and opened.request == run.request else None
         link = link_of(run, self._view(), self._catalog, self._services.catalog.scenes, self._roots, recording)
-        html = address_html(link, self._name, self._followed, self._told_numbers(run.trace))
+        html = address_html(link, self._name, self._arrived, self._told_numbers(run.trace))
         update_widget(self._address, content=html)
 
     def _told_numbers(self, trace: Trace) -> dict[str, str] | None:

@@ -7,7 +7,7 @@
 // shows its beginning.
 (() => {
   const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150, REVEAL_MS = 3000;
-  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, front = "", titled = null, asked = "";
+  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, front = "", titled = null, asked = "", told = "";
   const fetched = new Set();
 
   function found(event) {
@@ -31,34 +31,39 @@
 
   function look() {
     if (!document.querySelector("[data-ready]")) return;
-    const names = seenElements("[data-view]").map((view) => view.dataset.view).sort().join(",");
-    if (names === seen) return;
-    seen = names;
+    seen = seenElements("[data-view]").map((view) => view.dataset.view).sort().join(",");
+    const report = [seen, front, asked].join(";");
+    if (report === told) return;
+    told = report;
     const nowhere = { left: 0, top: 0, width: 1, height: 1 };
-    tell(`views:${names}`, nowhere, { clientX: 0, clientY: 0, shiftKey: false }, { x: 0, y: 0 });
+    tell(`views:${report}`, nowhere, { clientX: 0, clientY: 0, shiftKey: false }, { x: 0, y: 0 });
   }
 
-  // Tabs can be dragged, so that a click does nothing; Enter is what their own keys know.
+  // Opens a tab of the views; false as long as it is not to be seen, unless its panel is folded. Tabs can be dragged, so
+  // that a click does nothing; Enter is what their own keys know.
   function openTab(name) {
+    if ((seen ?? "").split(",").includes(name)) return true;
     const tab = [...document.querySelectorAll("[role=tab]")].find((one) => one.textContent.trim() === name);
     tab?.dispatchEvent(new KeyboardEvent("keydown", { key: "Enter", bubbles: true, cancelable: true }));
+    return tab !== undefined && tab.getClientRects().length === 0;
   }
 
-  // Brings the tab to the front that goes with the step, unless a person has left the one that went with the last.
+  const linkedTab = () => document.querySelector("[data-tab]")?.dataset.tab ?? "";
+
+  // Brings the tab to the front that goes with the step, unless a person has left the one that went with the last, or a
+  // link asks for another one.
   function followStep() {
     const wanted = document.querySelector("[data-front]")?.dataset.front ?? "", views = (seen ?? "").split(",");
     if (!wanted || wanted === front || seen === null) return;
-    if (front === "" || views.includes(front)) {
-      if (!views.includes(wanted)) openTab(wanted);
-    }
+    const follows = (front === "" || views.includes(front)) && linkedTab() === asked;
+    if (follows && !openTab(wanted)) return;
     front = wanted;
   }
 
   // Brings the tab to the front that a link asked for, "NAME NUMBER": as if a person had chosen it there.
   function followLink() {
-    const wanted = document.querySelector("[data-tab]")?.dataset.tab ?? "";
-    if (wanted !== asked && seen !== null) openTab(wanted.split(" ")[0]);
-    if (seen !== null) asked = wanted;
+    const wanted = linkedTab();
+    if (wanted !== asked && seen !== null && openTab(wanted.split(" ")[0])) asked = wanted;
   }
 
   function reveal() {

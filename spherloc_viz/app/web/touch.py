@@ -2,9 +2,10 @@
 
 The page carries a small script (``touch.js``). Any element with ``data-touch="ACTION:ARGUMENT"`` reports a press of the
 mouse, or Enter where the element has the focus. With ``data-drag`` as well, dragging across it is reported too. Which
-elements with ``data-view="NAME"`` are to be seen is reported as the action "views" with the names as its argument. A
-key presses the element with ``data-key="KEY"`` that can be seen, unless something is being written. A link is never
-part of what is pressed around it.
+elements with ``data-view="NAME"`` are to be seen is reported as the action "views"; its argument is their names, the
+view of a step and that of a link which the page has opened last, with semicolons between the three. A key presses the
+element with ``data-key="KEY"`` that can be seen, unless something is being written. A link is never part of what is
+pressed around it.
 """
 
 import json
