@@ -54,7 +54,8 @@ class LeftPanels:
             gui.add_html(glossary_html())
             self._card = gui.add_html("")
         self._opening = self._of_step = self._asked = ""
-        self._tab = TABS[0]
+        self.tab = TABS[0]
+        """The view that a person or a link has brought to the front, for the page's link."""
         self._seen, self._changed = frozenset({"Yaw"}), changed
         touches.on("views", self._see)
         with _view(gui, views, "Yaw"):
@@ -122,14 +123,9 @@ class LeftPanels:
         if not self._introduction.content:
             self._introduction.content = introduction_html(steps(run.trace))
 
-    @property
-    def tab(self) -> str:
-        """The view that a person or a link has brought to the front, for the page's link."""
-        return self._tab
-
     def open_tab(self, tab: str) -> None:
         """Bring a view to the front, once: then it is the person's to choose."""
-        self._tab = tab
+        self.tab = tab
         if tab != TABS[0]:
             self._asked = f"{tab} {1 + int(self._asked.partition(' ')[2] or 0)}"
 
@@ -156,7 +152,7 @@ class LeftPanels:
         self._seen = frozenset(seen.split(","))
         if (of_step, asked) == (self._of_step, self._asked):
             chosen = [] if of_step in self._seen else [name for name in TABS[1:] if name in self._seen]
-            self._tab = chosen[0] if chosen else TABS[0]
+            self.tab = chosen[0] if chosen else TABS[0]
         self._changed(None)
 
     def _widen(self, touch: Touch) -> None:

@@ -7,7 +7,8 @@
 // shows its beginning.
 (() => {
   const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150, REVEAL_MS = 3000;
-  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, front = "", titled = null, asked = "", told = "";
+  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, titled = null;
+  let front = "", asked = "", told = "";  // the tabs of a step and of a link that were opened last, and the last report
   const fetched = new Set();
 
   function found(event) {
@@ -63,7 +64,7 @@
   // Brings the tab to the front that a link asked for, "NAME NUMBER": as if a person had chosen it there.
   function followLink() {
     const wanted = linkedTab();
-    if (wanted !== asked && seen !== null && openTab(wanted.split(" ")[0])) asked = wanted;
+    if (wanted !== asked && seen !== null && (wanted === "" || openTab(wanted.split(" ")[0]))) asked = wanted;
   }
 
   function reveal() {
