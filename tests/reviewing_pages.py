@@ -103,7 +103,7 @@ class Visitor:
 
     def see(self) -> None:
         """Have the tab in front."""
-        self.touch("views:Recordings")
+        self.touch("views:Recordings;Yaw;")
 
 
 def recorded_twice(office: Office) -> tuple[Visitor, str, str]:

@@ -33,7 +33,7 @@ class Stage:
         self.redraws = 0
         self.touches = Touches(self._failed)
         self.panel = ComparePanel(gui, self.touches, self.used.append, self._redraw)
-        self.touch("views:Compare,Yaw")
+        self.touch("views:Compare,Yaw;Yaw;")
 
     def _failed(self, error: Exception) -> None:
         raise error

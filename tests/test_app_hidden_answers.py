@@ -20,7 +20,7 @@ TELLING = re.compile(
 TRUE = {"off the truth", "rotation error", "position error", "precision", "recall"}
 OTHERS = frozenset({"comparison/mc-exact", "comparison/ransac-2p"})
 """Cameras of other estimators."""
-VIEWS = "views:Charts,Compare,Graph,Images,Matches,Recordings,Residuals,Yaw"
+VIEWS = "views:Charts,Compare,Graph,Images,Matches,Recordings,Residuals,Yaw;Residuals;"
 
 
 @pytest.fixture

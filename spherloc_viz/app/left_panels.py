@@ -20,7 +20,7 @@ from spherloc_viz.app.plots.graph_view import GraphView
 from spherloc_viz.app.plots.residual_view import ResidualView
 from spherloc_viz.app.plots.yaw_view import YawView
 from spherloc_viz.app.text import legend_html, opening_card_html, opening_html, summary_html, table_html
-from spherloc_viz.app.web.touch import READY, Touch, Touches
+from spherloc_viz.app.web.touch import READY, Touch, Touches, seen_views
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers import graph_begins, steps
 from spherloc_viz.layers.primitives import Picture, Table
@@ -146,12 +146,12 @@ class LeftPanels:
             self._changed(None)
 
     def _see(self, touch: Touch) -> None:
-        """The page reports which views can be seen now, and which step's view and which link's it has opened by now: as
-        long as these are older ones, what is seen is nobody's choice."""
-        seen, of_step, asked = (touch.argument + ";;").split(";")[:3]
-        self._seen = frozenset(seen.split(","))
-        if (of_step, asked) == (self._of_step, self._asked):
-            chosen = [] if of_step in self._seen else [name for name in TABS[1:] if name in self._seen]
+        """The page reports which views can be seen now. As long as it has not opened those of the step and the link at
+        hand, what is seen is nobody's choice."""
+        seen = seen_views(touch.argument)
+        self._seen = seen.names
+        if (seen.of_step, seen.of_link) == (self._of_step, self._asked):
+            chosen = [] if seen.of_step in seen.names else [name for name in TABS[1:] if name in seen.names]
             self.tab = chosen[0] if chosen else TABS[0]
         self._changed(None)
 

@@ -19,7 +19,7 @@ from spherloc.watch import Cancelled, Watch
 from spherloc_viz import style
 from spherloc_viz.app.plots.charts import chart_svg
 from spherloc_viz.app.text import DIM, WITHHELD, WORDS, box, dot_html, status_html
-from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.touch import Touch, Touches, seen_views
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.layers.comparison import (
     FIRST,
@@ -146,7 +146,7 @@ class ComparePanel:
 
     def _see(self, touch: Touch) -> None:
         """The page reports which tabs are open now."""
-        seen = VIEW in touch.argument.split(",")
+        seen = VIEW in seen_views(touch.argument).names
         if seen != self._seen:
             self._seen = seen
             self._changed(None)

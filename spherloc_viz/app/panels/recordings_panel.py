@@ -21,7 +21,7 @@ from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.review.run_list import RunList
 from spherloc_viz.app.text import WITHHELD, box, status_html
 from spherloc_viz.app.web.downloads import Downloads
-from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.touch import Touch, Touches, seen_views
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.recording.replay import Reopened
 from spherloc_viz.recording.run_row import RunRow
@@ -118,7 +118,7 @@ class RecordingsPanel:
 
     def _see(self, touch: Touch) -> None:
         """Other tabs are open now."""
-        before, self._seen = self._seen, VIEW in touch.argument.split(",")
+        before, self._seen = self._seen, VIEW in seen_views(touch.argument).names
         if self._seen and not before and self._library is not None:
             self._preparing.ask(self._library.prepare)
         self._show()

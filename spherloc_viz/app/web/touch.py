@@ -2,8 +2,7 @@
 
 The page carries a small script (``touch.js``). Any element with ``data-touch="ACTION:ARGUMENT"`` reports a press of the
 mouse, or Enter where the element has the focus. With ``data-drag`` as well, dragging across it is reported too. Which
-elements with ``data-view="NAME"`` are to be seen is reported as the action "views"; its argument is their names, the
-view of a step and that of a link which the page has opened last, with semicolons between the three. A key presses the
+elements with ``data-view="NAME"`` are to be seen is reported as the action "views" (``seen_views``). A key presses the
 element with ``data-key="KEY"`` that can be seen, unless something is being written. A link is never part of what is
 pressed around it.
 """
@@ -35,6 +34,24 @@ class Touch:
     from_y: float
     extend: bool
     """Whether Shift, Ctrl or Cmd was held."""
+
+
+@dataclass(frozen=True)
+class SeenViews:
+    """What the action "views" reports."""
+
+    names: frozenset[str]
+    """Of the views that can be seen. Untrusted, as the others."""
+    of_step: str
+    """The view that the page has opened last since it goes with a step."""
+    of_link: str
+    """That which it has opened last for a link."""
+
+
+def seen_views(argument: str) -> SeenViews:
+    """What the argument of the action "views" says, "NAME,NAME;VIEW OF STEP;VIEW OF LINK"; what is missing is empty."""
+    names, of_step, of_link = (argument + ";;").split(";")[:3]
+    return SeenViews(frozenset(names.split(",")), of_step, of_link)
 
 
 Handler = Callable[[Touch], object]
