@@ -103,7 +103,13 @@ install_debian() {
 # --- steps ------------------------------------------------------------------------------------------------------------
 
 check_python() {
-  venv_works && return
+  local version='import sys; print("%d.%d" % sys.version_info[:2])'
+  if venv_works; then
+    [ "$("$python" -c "$version" 2>/dev/null)" = "$("$venv" -c "$version")" ] ||
+      say "using the $("$venv" --version) of .venv, not $python; 'make clean' first, to start from that."
+    python=$venv
+    return
+  fi
   command -v "$python" >/dev/null || die "there is no $python; name a Python 3.11 or newer with: make PYTHON=/path/to/python3"
   "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
     die "$python is $("$python" --version 2>&1), too old; name a Python 3.11 or newer with: make PYTHON=/path/to/python3"
