@@ -86,17 +86,20 @@ def polish(matches, chosen, rotation, translation, noise, robust, most_steps):
     """Minimise the cost over the chosen ``matches``; return the accepted steps. The pose is changed in place.
 
     ``chosen`` (M,) bool, ``rotation`` (3, 3), ``translation`` (3,) m, ``noise`` a ``Noise``, ``robust`` one of
-    ``ROBUST_*``. A gravity of standard deviation 0 is 4 DoF: the rotation is projected to a pure yaw first. inf is
-    6 DoF without prior, or 4 DoF at the given tilt for fewer than ``MIN_FOR_SIX_DOF``. Fewer than two chosen leave
-    the pose. The cost never rises (after the projection), and no NaN is written. Chosen points must lie in front of
-    their bearings.
+    ``ROBUST_*``, ``most_steps`` the steps at most. A gravity of standard deviation 0 is 4 DoF: the rotation is
+    projected to a pure yaw first. inf is 6 DoF without prior, or 4 DoF at the given tilt for fewer than
+    ``MIN_FOR_SIX_DOF``. Fewer than two chosen leave the pose. The cost never rises (after the projection), and no NaN
+    is written. Chosen points must lie in front of their bearings.
     """
     return polish_path(matches, chosen, rotation, translation, noise, robust, most_steps, np.empty((0, 3, 4)))
 
 
 @kernel()
 def polish_path(matches, chosen, rotation, translation, noise, robust, most_steps, path):
-    """As ``polish``; the pose after each accepted step is written to ``path`` (K, 3, 4) as far as that reaches."""
+    """As ``polish``; the pose after each accepted step is written to ``path`` (K, 3, 4) as far as that reaches.
+
+    ``matches``, ``chosen``, ``rotation``, ``translation``, ``noise``, ``robust`` and ``most_steps`` are as there.
+    """
     count, centre = middle_of(matches.points, chosen)
     if count < 2:
         return 0
@@ -141,7 +144,10 @@ def polish_path(matches, chosen, rotation, translation, noise, robust, most_step
 
 @kernel()
 def degrees_of_freedom(count, gravity_sd_rad):
-    """6, or 4 where the tilt stays as it is: gravity exact, or unknown with too few of ``count`` points to find it."""
+    """6, or 4 where the tilt stays as it is: gravity exact, or unknown with too few of ``count`` points to find it.
+
+    ``gravity_sd_rad`` is its standard deviation, rad, inf if it is unknown.
+    """
     unknown = gravity_sd_rad == np.inf and count < MIN_FOR_SIX_DOF
     return 4 if unknown or gravity_sd_rad < MIN_GRAVITY_SD_RAD else 6
 
@@ -175,7 +181,7 @@ def write_yaw(yaw, rotation):
 
 @kernel()
 def levelled(cam_from_map, centre):
-    """The pose (3, 4) with the nearest yaw for its rotation that leaves the point ``centre`` (3,), m, where it is."""
+    """The level pose (3, 4) nearest to ``cam_from_map`` (3, 4) that leaves the point ``centre`` (3,), m, in place."""
     level, tilt = np.empty((3, 4)), np.empty((3, 3))
     write_yaw(nearest_yaw(cam_from_map), level)
     for a in range(3):
@@ -189,7 +195,10 @@ def levelled(cam_from_map, centre):
 
 @kernel()
 def turn(step, rotation, turned):
-    """Write Exp(w) R (3, 3) to ``turned``, w = ``step[:3]`` in rad (Rodrigues, exact to rounding at zero)."""
+    """Write Exp(w) R to ``turned`` (3, 3), w = ``step[:3]`` in rad, R = ``rotation`` (3, 3).
+
+    By Rodrigues' formula, exact to rounding at zero.
+    """
     wx, wy, wz = step[0], step[1], step[2]
     angle = np.sqrt(wx * wx + wy * wy + wz * wz)
     first, second = 1.0, 0.5
@@ -206,7 +215,10 @@ def turn(step, rotation, turned):
 
 @kernel()
 def robust_weight(square, robust):
-    """rho(s) and its derivative, s = ``square`` a squared residual in units of the noise's variance."""
+    """rho(s) and its derivative, s = ``square`` a squared residual in units of the noise's variance.
+
+    ``robust`` is one of ``ROBUST_*``.
+    """
     if robust == ROBUST_HUBER and square > HUBER_WIDTH * HUBER_WIDTH:
         norm = np.sqrt(square)
         return HUBER_WIDTH * (2.0 * norm - HUBER_WIDTH), HUBER_WIDTH / norm
@@ -304,8 +316,8 @@ def tilt_of(rotation):
 def add_gravity(rotation, gravity_sd_rad, system):
     """Cost of the gravity prior at ``rotation`` (3, 3); add its J^T J and J^T r to ``system``, ``NormalEquations``.
 
-    The residual is the tilt's angle times the horizontal direction u of R e_y = (u sin, cos), not its sine, which
-    would fold beyond 90 degrees.
+    ``gravity_sd_rad`` is the prior's standard deviation. The residual is the tilt's angle times the horizontal
+    direction u of R e_y = (u sin, cos), not its sine, which would fold beyond 90 degrees.
     """
     if gravity_sd_rad == np.inf:
         return 0.0
@@ -355,7 +367,7 @@ def factorise(hessian, damping, factor):
 
 @kernel()
 def scale_of(hessian, k):
-    """What scales column ``k`` of the normal equations (6, 6) to length 1."""
+    """What scales column ``k`` of the normal equations ``hessian`` (6, 6) to length 1."""
     return 1.0 / np.sqrt(hessian[k, k]) if hessian[k, k] > 0.0 else 1.0
 
 

@@ -71,9 +71,9 @@ MIN_FOR_NOISE = 8
 
 @kernel()
 def errors_of(matches, cam_from_map, errors):
-    """Write the reprojection ``errors`` (M,) at a pose (3, 4), px to first order; inf for points behind their bearing.
+    """Write the reprojection ``errors`` (M,) at a pose, px to first order; inf for points behind their bearing.
 
-    ``matches`` are ``gauss_newton.Matches``, as in all functions here.
+    The pose is ``cam_from_map`` (3, 4). ``matches`` are ``gauss_newton.Matches``, as in all functions here.
     """
     bearings, points, jacobian, p = matches.bearings, matches.points, matches.pixel_jacobian, cam_from_map
     for k in range(len(points)):
@@ -90,10 +90,10 @@ def errors_of(matches, cam_from_map, errors):
 
 @kernel()
 def truncated_squares(matches, limits_px, cam_from_map, noise, most):
-    """The truncated squares of a pose (3, 4) at the bounds ``limits_px`` (M,); more than ``most`` once that is passed.
+    """The truncated squares of a pose at the bounds ``limits_px`` (M,); more than ``most`` once that is passed.
 
-    In variances of ``noise``, a ``gauss_newton.Noise``. The tilt costs nothing where gravity is exact (the pose keeps
-    it) or unknown.
+    Of ``matches`` at ``cam_from_map`` (3, 4), in variances of ``noise``, a ``gauss_newton.Noise``. The tilt costs
+    nothing where gravity is exact (the pose keeps it) or unknown.
     """
     bearings, points, jacobian, p = matches.bearings, matches.points, matches.pixel_jacobian, cam_from_map
     precision, total = noise.sd_px**-2.0, 0.0
@@ -116,9 +116,10 @@ def truncated_squares(matches, limits_px, cam_from_map, noise, most):
 
 @kernel()
 def robust_steps(matches, limits_px, cam_from_map, noise, most_steps):
-    """Move ``cam_from_map`` (3, 4) in place by Gauss-Newton steps on Geman-McClure weights.
+    """Move ``cam_from_map`` (3, 4) in place by ``most_steps`` Gauss-Newton steps on Geman-McClure weights.
 
-    Only matches within ``limits_px`` (M,) of the pose count, chosen anew for each step.
+    Only ``matches`` within ``limits_px`` (M,) of the pose count, chosen anew for each step; ``noise`` is a
+    ``gauss_newton.Noise``.
     """
     bearings, points, jacobian = matches.bearings, matches.points, matches.pixel_jacobian
     count = len(points)
@@ -139,9 +140,10 @@ def robust_steps(matches, limits_px, cam_from_map, noise, most_steps):
 
 @kernel()
 def _step(matches, chosen, cam_from_map, noise, damping):
-    """One Gauss-Newton step of a pose (3, 4) on the ``chosen`` (M,) matches, in place; its length, 0 if there is none.
+    """One Gauss-Newton step of a pose on the ``chosen`` (M,) ``matches``, in place; its length, 0 if there is none.
 
-    The length is that of the rotation vector, rad, and the translation, m, together.
+    The pose is ``cam_from_map`` (3, 4), ``noise`` a ``gauss_newton.Noise``, ``damping`` is added to the scaled
+    diagonal. The length is that of the rotation vector, rad, and the translation, m, together.
     """
     count, centre = middle_of(matches.points, chosen)
     if count < 2:
@@ -176,7 +178,8 @@ def _step(matches, chosen, cam_from_map, noise, damping):
 def narrow(matches, wide_px, tight_px, start, noise, path):
     """Fits from ``start`` (3, 4) at bounds that narrow from ``wide_px`` (M,) to ``tight_px`` (M,), each from the last.
 
-    The pose at each bound is written to ``path`` (``len(NARROWINGS)``, 3, 4).
+    To ``matches`` with ``noise``, a ``gauss_newton.Noise``. The pose at each bound is written to ``path``
+    (``len(NARROWINGS)``, 3, 4).
     """
     state, limits = np.empty((3, 4)), np.empty(len(wide_px))
     copy_matrix(start, state)
@@ -191,8 +194,9 @@ def narrow(matches, wide_px, tight_px, start, noise, path):
 def descend(matches, limits_px, cam_from_map, noise, path):
     """Least squares on the inliers and new choices of these while the truncated squares fall.
 
-    ``cam_from_map`` (3, 4) is changed in place, the pose after each choice written to ``path`` (``MAX_DESCENTS``, 3,
-    4). Returns how many, and the truncated squares at the bounds ``limits_px`` (M,).
+    Of ``matches`` with ``noise``, a ``gauss_newton.Noise``. ``cam_from_map`` (3, 4) is changed in place, the pose after
+    each choice written to ``path`` (``MAX_DESCENTS``, 3, 4). Returns how many, and the truncated squares at the bounds
+    ``limits_px`` (M,).
     """
     count, states = len(matches.points), 0
     errors, before, mask = np.empty(count), np.zeros(count, np.bool_), np.empty(count, np.bool_)
@@ -222,8 +226,8 @@ def descend(matches, limits_px, cam_from_map, noise, path):
 def search_nearby(matches, wide_px, limits_px, start, noise, best, least):
     """Look for a better pose than ``best`` by fits to few random ones of what ``start`` explains within ``wide_px``.
 
-    ``best`` (3, 4), of ``least`` truncated squares at the bounds ``limits_px`` (M,), is changed in place; returns its
-    truncated squares. Every call draws alike.
+    Of ``matches`` with ``noise``, a ``gauss_newton.Noise``. ``best`` (3, 4), of ``least`` truncated squares at the
+    bounds ``limits_px`` (M,), is changed in place; returns its truncated squares. Every call draws alike.
     """
     errors = np.empty(len(matches.points))
     errors_of(matches, start, errors)
@@ -278,7 +282,7 @@ def _take(matches, sample, few):
 def _samples_needed(matches, limits_px, best, around, errors):
     """Samples from ``around`` (K,) after which one was surely drawn from inliers of the ``best`` pose only (Eq. 28).
 
-    ``errors`` (M,) px are written.
+    Inliers are ``matches`` within ``limits_px`` (M,); ``errors`` (M,) px are written.
     """
     errors_of(matches, best, errors)
     inliers = 0
@@ -294,8 +298,9 @@ def _samples_needed(matches, limits_px, best, around, errors):
 def share_of_fine(errors, near, limits_px, noise_px, share, rounds, fine_probability):
     """Share of the ``near`` (M,) matches with the finer noise, from a guess ``share``, after so many ``rounds``.
 
-    Expectation and maximisation of a mixture of two normal distributions in the plane, cut off at ``limits_px`` (M,),
-    from ``errors`` (M,) px. Each one's probability of finer noise is written to ``fine_probability`` (M,).
+    Expectation and maximisation of a mixture of two normal distributions in the plane, of standard deviation
+    ``noise_px`` and a finer one, cut off at ``limits_px`` (M,), from ``errors`` (M,) px. Each one's probability of
+    finer noise is written to ``fine_probability`` (M,).
     """
     wide, sharp = 0.5 / noise_px**2, 0.5 / (FINE_NOISE * noise_px) ** 2
     for _ in range(rounds):
@@ -345,7 +350,7 @@ def fit_to_noise(matches, limits_px, cam_from_map, noise, path):
 
 @kernel()
 def _draw(random_state, count):
-    """The next state (uint64) of the generator xorshift64, and a random number from 0 to ``count`` - 1."""
+    """The state of xorshift64 after ``random_state`` (uint64), and a random number from 0 to ``count`` - 1."""
     random_state ^= random_state << np.uint64(13)
     random_state ^= random_state >> np.uint64(7)
     random_state ^= random_state << np.uint64(17)

@@ -50,8 +50,8 @@ def variance_factor(matches: Matches, cam_from_map: FloatArray, inliers: BoolArr
 def _add_up(matches, inliers, groups, cam_from_map, noise_px, information, scores):
     """Add the sum of J' J to ``information`` (6, 6), and the scores J' r to the ``scores`` (G, 6) of their groups.
 
-    J is of a step (w, d), rad and m, from a pose (3, 4). ``groups`` (K,) are the numbers of the groups of the
-    ``inliers`` (M,) among the ``matches``; residuals count in units of ``noise_px``.
+    J is of a step (w, d), rad and m, from the pose ``cam_from_map`` (3, 4). ``groups`` (K,) are the numbers of the
+    groups of the ``inliers`` (M,) among the ``matches``; residuals count in units of ``noise_px``.
     """
     jacobian, n = np.empty(6), 0
     for k in range(len(inliers)):

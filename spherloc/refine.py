@@ -223,7 +223,7 @@ def _covariance(aligned: AlignedProblem, cam_from_map: FloatArray, centre: Float
 
 @kernel()
 def _residuals(matches, cam_from_map):
-    """Reprojection errors (M,), px, at a pose (3, 4); see ``residuals_px``."""
+    """Reprojection errors (M,), px, of ``matches`` at ``cam_from_map`` (3, 4); see ``residuals_px``."""
     errors = np.empty(len(matches.points))
     errors_of(matches, cam_from_map, errors)
     return errors
@@ -231,7 +231,7 @@ def _residuals(matches, cam_from_map):
 
 @kernel()
 def _inlier_counts(matches, poses, bound_px):
-    """Matches within ``bound_px`` of each of the ``poses`` (P, 3, 4)."""
+    """How many ``matches`` are within ``bound_px`` (px) at each of the ``poses`` (P, 3, 4): (P,)."""
     counts, errors = np.zeros(len(poses), np.int64), np.empty(len(matches.points))
     for p in range(len(poses)):
         errors_of(matches, poses[p], errors)
@@ -244,9 +244,10 @@ def _inlier_counts(matches, poses, bound_px):
 def _alternate(matches, wide_px, tight_px, path, noise, robust, limits, lost):
     """Fit and choose inliers in turn from ``path[0]``; return how many poses of ``path`` (I, 3, 4) lead to the best.
 
-    ``wide_px`` (M,) are the bounds while gravity is kept, ``tight_px`` the one bound once the tilt is estimated. Also
-    returned is an inlier's bound, if below ``wide_px`` (else inf). ``limits`` (M,) are set to the bounds of the end,
-    and ``lost`` (M,) to what the start explains within these, if that is more than the best explains (else to none).
+    ``matches``, ``noise`` and ``robust`` are as in ``gauss_newton.polish``. ``wide_px`` (M,) are the bounds while
+    gravity is kept, ``tight_px`` the one bound once the tilt is estimated. Also returned is an inlier's bound, if below
+    ``wide_px`` (else inf). ``limits`` (M,) are set to the bounds of the end, and ``lost`` (M,) to what the start
+    explains within these, if that is more than the best explains (else to none).
     """
     states, count = 1, len(matches.points)
     first_errors, errors, mask = np.empty(count), np.empty(count), np.empty(count, np.bool_)
@@ -288,11 +289,12 @@ def _alternate(matches, wide_px, tight_px, path, noise, robust, limits, lost):
 def rescue(matches, limits_px, explained, path, states, noise):
     """Move on from the last of the ``states`` of ``path`` until as many as are in ``explained`` (M,) are inliers.
 
-    The next poses are written to ``path`` (I, 3, 4); returns how many, 0 if in vain.
+    These are ``matches`` within ``limits_px`` (M,). The next poses are written to ``path`` (I, 3, 4); returns how many,
+    0 if in vain.
 
-    Least squares on these, each of them weighing more the more often it was found to be outside. In vain too if the
-    pose ends farther from the least-squares one, in the latter's residuals, than noise explains: then it would be bent
-    towards an outlier.
+    Least squares on those explained, each of them weighing more the more often it was found to be outside. In vain too
+    if the pose ends farther from the least-squares one, in the latter's residuals, than ``noise`` explains: then it
+    would be bent towards an outlier.
     """
     count = len(matches.points)
     errors, fitted, inside = np.empty(count), np.empty(count, np.bool_), np.empty(count, np.bool_)
@@ -323,7 +325,7 @@ def rescue(matches, limits_px, explained, path, states, noise):
 def _account(matches, limits_px, path):
     """Inlier mask (M,) of the last pose of ``path`` (I, 3, 4); mean squared residual of these, px^2, and inliers.
 
-    The latter two (I,) are of every pose. Inliers are those within ``limits_px`` (M,).
+    The latter two (I,) are of every pose. Inliers are ``matches`` within ``limits_px`` (M,).
     """
     errors, inliers, mask = (
         np.empty(len(limits_px)),
@@ -344,7 +346,8 @@ def _account(matches, limits_px, path):
 def _step_covariance(matches, inliers, cam_from_map, noise, robust):
     """Degrees of freedom; middle (3,) of the ``inliers`` (M,), m; covariance (6, 6) of a step (w, d), rad and m.
 
-    The step is from a pose (3, 4); its covariance is NaN if it has none.
+    The step is from the pose ``cam_from_map`` (3, 4); its covariance is NaN if it has none. ``matches``, ``noise`` and
+    ``robust`` are as in ``gauss_newton.polish``.
     """
     count, centre = middle_of(matches.points, inliers)
     dof = degrees_of_freedom(count, noise.gravity_sd_rad)

@@ -29,14 +29,14 @@ def copy_matrix(source, target):
 
 @kernel()
 def fill_vector(target, value):
-    """Write a number to all of ``target`` (N,)."""
+    """Write the number ``value`` to all of ``target`` (N,)."""
     for k in range(len(target)):
         target[k] = value
 
 
 @kernel()
 def fill_matrix(target, value):
-    """Write a number to all of ``target`` (N, K)."""
+    """Write the number ``value`` to all of ``target`` (N, K)."""
     for a in range(target.shape[0]):
         for b in range(target.shape[1]):
             target[a, b] = value
@@ -44,7 +44,7 @@ def fill_matrix(target, value):
 
 @kernel()
 def rotation_of(cam_from_map):
-    """A copy of the rotation (3, 3) of a pose (3, 4)."""
+    """A copy of the rotation (3, 3) of the pose ``cam_from_map`` (3, 4)."""
     rotation = np.empty((3, 3))
     copy_matrix(cam_from_map, rotation)
     return rotation
@@ -52,7 +52,7 @@ def rotation_of(cam_from_map):
 
 @kernel()
 def translation_of(cam_from_map):
-    """A copy of the translation (3,), m, of a pose (3, 4)."""
+    """A copy of the translation (3,), m, of the pose ``cam_from_map`` (3, 4)."""
     translation = np.empty(3)
     for k in range(3):
         translation[k] = cam_from_map[k, 3]
@@ -116,7 +116,7 @@ def count_true(mask):
 
 @kernel()
 def equal(a, b):
-    """Whether two vectors (N,) are equal in all elements."""
+    """Whether the vectors ``a`` and ``b`` (N,) are equal in all elements."""
     same = True
     for k in range(len(a)):
         same = same and a[k] == b[k]

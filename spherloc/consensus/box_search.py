@@ -95,7 +95,11 @@ def _yaw_of_turn(turn):
 
 @kernel()
 def _in_window(scratch, kept, count, start, end, out):
-    """Write those of ``count`` in ``kept`` whose interval meets a window of turns to ``out`` (K,); returns how many."""
+    """Write those of ``count`` matches in ``kept`` (K,) whose interval meets a window of turns to ``out`` (K,).
+
+    The intervals are those of ``scratch``, a ``Scratch``; the window goes from ``start`` to ``end``, turns. Returns how
+    many.
+    """
     used = 0
     for k in range(count):
         first, last = scratch.starts[k], scratch.ends[k]
@@ -117,8 +121,8 @@ def _in_window(scratch, kept, count, start, end, out):
 def search_boxes(matches, tasks, yaw_bound, memory, limits, found, board):
     """Search the boxes ``tasks`` = (charts (K,), lower (K, 6), upper (K, 6), bounds (K,)) at all yaws.
 
-    ``yaw_bound`` (B,) is what is known of the bins of turn, ``memory`` is ``Memory``; the others are as in
-    ``search_poses``.
+    ``yaw_bound`` (B,) is what is known of the bins of turn, ``memory`` is ``Memory``; ``matches``, ``limits``,
+    ``found`` and ``board`` are as in ``search_poses``.
     """
     boxes, scratch, room, splits = memory
     charts, lowers, uppers, bounds = tasks

@@ -213,10 +213,11 @@ def _as_matrices(poses: FloatArray) -> FloatArray:
 
 @kernel()
 def _pieces(arcs, nodes, count, start, end, board):
-    """``Arcs`` among ``nodes`` (K,) that touch the bin from turn ``start`` to turn ``end``, clipped to it.
+    """Those of ``arcs``, ``Arcs``, between ``nodes`` (K,) that touch a bin, clipped to it.
 
-    Nodes are numbers of ``count`` matches. Returns edges (E, 2), indices into ``nodes``, and their first and last ends
-    (E,), (E,), turns. A watch's ``board`` can end it, after which there are none.
+    The bin goes from turn ``start`` to turn ``end``. Nodes are numbers of ``count`` matches. Returns edges (E, 2),
+    indices into ``nodes``, and their first and last ends (E,), (E,), turns. A watch's ``board`` can end it, after which
+    there are none.
     """
     pairs, lo, hi = arcs
     index_of = np.empty(count, np.int64)
@@ -248,7 +249,10 @@ def _pieces(arcs, nodes, count, start, end, board):
 
 @kernel()
 def _common(rows, a, b, out):
-    """Write the common neighbours of two nodes of a graph ``rows`` (K, words) to ``out`` (words,); returns how many."""
+    """Write the common neighbours of nodes ``a`` and ``b`` of a graph ``rows`` (K, words) to ``out`` (words,).
+
+    Returns how many.
+    """
     found = 0
     for w in range(rows.shape[1]):
         word = rows[a, w] & rows[b, w]
@@ -259,7 +263,7 @@ def _common(rows, a, b, out):
 
 @kernel()
 def _members(bits, count):
-    """The ``count`` nodes (N,) of a bitset (words,), ascending."""
+    """The ``count`` nodes (N,) of the bitset ``bits`` (words,), ascending."""
     nodes = np.empty(count, np.int64)
     used = 0
     for w in range(len(bits)):
@@ -276,7 +280,8 @@ def _members(bits, count):
 def _candidates(matches, yaws, ball, nodes, common, shared):
     """Those of the ``shared`` neighbours in the bitset ``common`` that may be seen from somewhere in a ``ball`` (4,).
 
-    Indices (C,) into ``nodes`` (K,), which are numbers of ``BoundedMatches``; ``yaws`` is a ``YawInterval``.
+    Indices (C,) into ``nodes`` (K,), which are numbers of ``matches``, ``BoundedMatches``; ``yaws`` is a
+    ``YawInterval``.
     """
     kept, used = np.empty(shared, np.int64), 0
     for index in _members(common, shared):
@@ -290,7 +295,8 @@ def _candidates(matches, yaws, ball, nodes, common, shared):
 def _completed(rows, a, b, candidates, floor, effort_limit, board):
     """A clique of nodes a, b and ``candidates`` (C,) with more than ``floor`` nodes in all, or nothing.
 
-    Nodes are those of the graph ``rows`` (K, words). Returns it, the effort, and whether it is exact.
+    Nodes are those of the graph ``rows`` (K, words). Returns it, the effort, and whether it is exact; that ends at
+    ``effort_limit`` or by a watch's ``board``.
     """
     small, old = subgraph(rows, candidates)
     inside, effort, exact = larger_clique(small, floor - 2, effort_limit, board)
@@ -306,11 +312,11 @@ def _completed(rows, a, b, candidates, floor, effort_limit, board):
 
 @kernel()
 def certify(matches, yaws, everybody, balls, best, board):
-    """Prove that no pose explains more of ``everybody`` (K,) than the best known one does.
+    """Prove that no pose explains more of ``everybody`` (K,), numbers of ``matches``, than the best known one does.
 
-    All that might are at ``yaws``, a ``YawInterval``, with positions in ``balls`` (B, 4). Better poses that are met are
-    added to ``best``, ``BestPoses``, and the proof goes on against them. Returns whether it is proven, and the effort.
-    A watch's ``board`` can end it unproven.
+    ``matches`` are ``BoundedMatches``. All poses that might are at ``yaws``, a ``YawInterval``, with positions in
+    ``balls`` (B, 4). Better poses that are met are added to ``best``, ``BestPoses``, and the proof goes on against
+    them. Returns whether it is proven, and the effort. A watch's ``board`` can end it unproven.
     """
     found = np.empty(5)
     effort, b = 0, 0
@@ -341,8 +347,8 @@ def sweep_bin(matches, arcs, nodes, rows, span, best, effort_limit, board):
     ``matches`` are ``BoundedMatches``, ``arcs`` the ``Arcs`` of all pairs; ``nodes`` (K,) and ``rows`` (K, words) are
     the bin's core and its graph, which is used up. ``best`` holds the verified poses, ``BestPoses``; better ones are
     added in place. Returns the bound for the bin, its largest clique that may have a pose (nodes; empty if none is
-    larger than the support), the effort, and whether the bin was searched to its end. A watch's ``board`` can end it,
-    and learns how much of the effort is left.
+    larger than the support), the effort, and whether the bin was searched to its end, within ``effort_limit``. A
+    watch's ``board`` can end it, and learns how much of the effort is left.
     """
     count, supports = len(matches.points), best.supports
     nothing = np.empty(0, np.int64)

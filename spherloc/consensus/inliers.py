@@ -33,8 +33,9 @@ def count_inliers(yaw, translation, matches, bound_px):
 def score_inliers(yaw, translation, matches, bound_px, mask):
     """Fill ``mask`` (M,) with what ``count_inliers`` counts; return how many, and the MSAC support.
 
-    The support is the sum of 1 - (error / bound)^2 over the inliers, so that M - support is the MSAC cost in units of
-    the squared bound (Torr and Zisserman, "MLESAC", 2000).
+    The pose is level: ``yaw``, rad, and ``translation`` (3,), m. ``matches`` are ``Matches``, ``bound_px`` (M,) their
+    bounds. The support is the sum of 1 - (error / bound)^2 over the inliers, so that M - support is the MSAC cost in
+    units of the squared bound (Torr and Zisserman, "MLESAC", 2000).
     """
     bearings, points, jacobian = matches.bearings, matches.points, matches.pixel_jacobian
     c, s = np.cos(yaw), np.sin(yaw)
@@ -56,7 +57,10 @@ def score_inliers(yaw, translation, matches, bound_px, mask):
 
 @kernel()
 def mark_each(yaws, translations, bearings, points, pixel_jacobian, bound_px):
-    """The inlier masks (J, M) of J level poses: ``yaws`` (J,), rad, and ``translations`` (J, 3), m."""
+    """The inlier masks (J, M) of J level poses: ``yaws`` (J,), rad, and ``translations`` (J, 3), m.
+
+    Of matches with ``bearings`` (M, 3), ``points`` (M, 3), m, ``pixel_jacobian`` (M, 2, 3) and ``bound_px`` (M,).
+    """
     matches = Matches(bearings, points, pixel_jacobian)
     masks = np.empty((len(yaws), len(points)), np.bool_)
     for k in range(len(yaws)):
@@ -74,7 +78,7 @@ ROWS = 10
 def pack_blocks(matches, bound_px, order):
     """The ``matches`` in the given ``order`` (K,), as ``reaches`` reads them: blocks of ROWS x BLOCK, flat.
 
-    The last block is filled up with what nothing explains.
+    ``bound_px`` (M,) are their bounds. The last block is filled up with what nothing explains.
     """
     count = len(order)
     blocks = np.zeros(((count + BLOCK - 1) // BLOCK, ROWS, BLOCK))

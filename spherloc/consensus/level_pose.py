@@ -128,7 +128,10 @@ def linearized(jacobian_row, gx, gy, gz, distance):
 
 @kernel()
 def accumulate(normal, gradient, weight, r, row):
-    """Add a weighted residual ``r`` with derivative ``row`` (4 numbers) to the equations, (4, 4) and (4,)."""
+    """Add a residual ``r`` with derivative ``row`` (4,) and a ``weight`` to the normal equations.
+
+    These are ``normal`` (4, 4), of which the lower triangle is kept, and ``gradient`` (4,).
+    """
     for a in range(4):
         gradient[a] += weight * row[a] * r
         for b in range(a + 1):
@@ -159,9 +162,9 @@ def fit(points, pixel_jacobian, weights, pose, steps):
 
 @kernel()
 def solve_step(normal, gradient, step):
-    """Write the ``step`` (4,) of the normal equations (4, 4) and (4,); return the fall of the cost, or -1.
+    """Write the ``step`` (4,) that solves the normal equations; return the fall of the cost, -1 if they are degenerate.
 
-    -1 means that they are degenerate. The lower triangle of ``normal`` becomes its Cholesky factor.
+    They are ``normal`` (4, 4), whose lower triangle becomes its Cholesky factor, and ``gradient`` (4,).
     """
     fall = 0.0
     for a in range(4):
@@ -198,7 +201,10 @@ def move(pose, step):
 
 @kernel()
 def residual(matches, k, pose, least_cos):
-    """Residual of match ``k`` at a level pose (5,), px; inf behind, or farther from the bearing than ``least_cos``."""
+    """Residual of match ``k`` at a level ``pose`` (5,), px; inf behind, or farther from the bearing than ``least_cos``.
+
+    ``matches`` are ``BoundedMatches``.
+    """
     gx, gy, gz, _ = ray(matches.points[k], pose)
     v, jacobian = matches.bearings[k], matches.pixel_jacobian[k]
     along = v[0] * gx + v[1] * gy + v[2] * gz
@@ -211,7 +217,7 @@ def residual(matches, k, pose, least_cos):
 
 @kernel()
 def mark_support(matches, pose, mask):
-    """Set ``mask`` (M,) to what a level ``pose`` (5,) explains of the ``BoundedMatches``; returns how many."""
+    """Set ``mask`` (M,) to what a level ``pose`` (5,) explains of ``matches``, ``BoundedMatches``; returns how many."""
     inliers = 0
     for k in range(len(mask)):
         mask[k] = residual(matches, k, pose, matches.least_cos[k]) <= matches.bound_px[k]
@@ -221,7 +227,7 @@ def mark_support(matches, pose, mask):
 
 @kernel()
 def explain_more(matches, members, pose, mask):
-    """Fit a level ``pose`` (5,) to what it explains, then to all ``members`` (K,).
+    """Fit a level ``pose`` (5,) to what it explains of ``matches``, ``BoundedMatches``, then to all ``members`` (K,).
 
     Pose and ``mask`` (M,) become the best that was met. First least squares on the inliers, again while they grow. That
     leaves out a correspondence beyond its bound though another pose explains it as well as all others. So then Lawson's
@@ -261,7 +267,7 @@ def explain_more(matches, members, pose, mask):
 def _reweight(matches, members, pose, weights):
     """Multiply the ``weights`` (M,) of the ``members`` (K,) by the share of the bound that their residuals take.
 
-    Their mean becomes 1.
+    The residuals are those of ``matches``, ``BoundedMatches``, at a level ``pose`` (5,). The mean weight becomes 1.
     """
     total = 0.0
     for k in members:
@@ -273,7 +279,10 @@ def _reweight(matches, members, pose, weights):
 
 @kernel()
 def _propose(matches, clique, pose):
-    """Write the 2P pose of a pair of the ``clique`` (K,) that explains most of the clique; false if no pair has one."""
+    """Write the 2P pose of a pair of the ``clique`` (K,) that explains most of the clique; false if no pair has one.
+
+    The clique has numbers of ``matches``, ``BoundedMatches``; the level ``pose`` (5,) is written.
+    """
     bearings, points = matches.bearings, matches.points
     few = Matches(np.empty((len(clique), 3)), np.empty((len(clique), 3)), np.empty((len(clique), 2, 3)))
     bound_px = np.empty(len(clique))
@@ -300,7 +309,10 @@ def _propose(matches, clique, pose):
 
 @kernel()
 def verify(matches, clique, best):
-    """Find the level pose that explains most of a ``clique`` (K,), and add it to the ``BestPoses`` if it is good."""
+    """Find the level pose that explains most of a ``clique`` (K,), and add it to ``best`` if it is good.
+
+    ``best`` are ``BestPoses``. The clique has numbers of ``matches``, ``BoundedMatches``.
+    """
     pose = np.empty(5)
     if _propose(matches, clique, pose):
         improve(matches, clique, pose, best)
@@ -308,7 +320,10 @@ def verify(matches, clique, best):
 
 @kernel()
 def improve(matches, members, pose, best):
-    """Improve a level ``pose`` (5,) in place, see ``explain_more``, and add it to ``best``, as ``verify`` does."""
+    """Improve a level ``pose`` (5,) in place, and add it to ``best``, as ``verify`` does.
+
+    ``matches`` and ``members`` are as in ``explain_more``.
+    """
     mask = np.empty(best.masks.shape[1], np.bool_)
     support = explain_more(matches, members, pose, mask)
     _keep(pose, support, mask, best)
@@ -316,7 +331,10 @@ def improve(matches, members, pose, best):
 
 @kernel()
 def _keep(pose, support, mask, best):
-    """Insert a ``pose`` (5,) that explains ``mask`` (M,) into the list, unless a better one explains much the same."""
+    """Insert a ``pose`` (5,) that explains ``mask`` (M,) into ``best``, unless a better one explains much the same.
+
+    ``support`` is how many it explains.
+    """
     poses, supports, masks, known = best.poses, best.supports, best.masks, best.known[0]
     position = known
     for index in range(known):

@@ -56,7 +56,7 @@ def max_clique(adjacency: NDArray[np.bool_], effort_limit: int = EFFORT_LIMIT, w
 
 @kernel()
 def _pack(adjacency):
-    """The graph (M, M) as bitsets (M, words) of renumbered nodes, and each one's old number (M,)."""
+    """The graph ``adjacency`` (M, M) as bitsets (M, words) of renumbered nodes, and each one's old number (M,)."""
     count, order = len(adjacency), _degeneracy_order(adjacency)
     rows = np.zeros((count, (count + 63) // 64), np.uint64)
     for node in range(count):
@@ -72,7 +72,7 @@ def _pack(adjacency):
 
 @kernel()
 def _all_adjacent(adjacency, nodes):
-    """Whether each of ``nodes`` (K,) is adjacent to all others in the graph (M, M)."""
+    """Whether each of ``nodes`` (K,) is adjacent to all others in the graph ``adjacency`` (M, M)."""
     for a in nodes:
         for b in nodes:
             if a != b and not adjacency[a, b]:
@@ -82,7 +82,7 @@ def _all_adjacent(adjacency, nodes):
 
 @kernel()
 def _degeneracy_order(adjacency):
-    """Nodes (M,) of a graph (M, M) by repeated removal of one of least degree, the first removed last.
+    """Nodes (M,) of a graph ``adjacency`` (M, M) by repeated removal of one of least degree, the first removed last.
 
     So dense nodes are coloured first.
     """
@@ -137,14 +137,14 @@ def lowest_bit(word):
 
 @kernel()
 def set_edge(rows, a, b):
-    """Join two nodes of the graph ``rows`` (M, words), in place."""
+    """Join nodes ``a`` and ``b`` of the graph ``rows`` (M, words), in place."""
     rows[a, b >> 6] |= ONE << np.uint64(b & 63)
     rows[b, a >> 6] |= ONE << np.uint64(a & 63)
 
 
 @kernel()
 def clear_edge(rows, a, b):
-    """Remove the edge between two nodes of the graph ``rows`` (M, words), in place."""
+    """Remove the edge between nodes ``a`` and ``b`` of the graph ``rows`` (M, words), in place."""
     rows[a, b >> 6] &= ~(ONE << np.uint64(b & 63))
     rows[b, a >> 6] &= ~(ONE << np.uint64(a & 63))
 
@@ -209,7 +209,7 @@ def larger_clique(rows, floor, effort_limit, board=None):
     """A largest clique (K,) if it has more than ``floor`` nodes, else an empty array; the effort; whether it is exact.
 
     The graph is ``rows`` (M, words). Nodes are numbered so that those of high degree come first. With an explicit
-    stack, not recursion. A watch's ``board`` can end it as its limit does.
+    stack, not recursion. It ends early, not exact, at ``effort_limit`` or by a watch's ``board``.
     """
     count, words = rows.shape
     best = np.empty(0, np.int64)

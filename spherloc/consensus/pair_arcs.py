@@ -87,10 +87,11 @@ def chord(angle):
 
 @kernel(inline="always")
 def pair_sinusoids(vi, vj, pi, pj, chord_i, chord_j, sin_i, sin_j):
-    """sin alpha, and the (cos, sin, constant) of f, s_i, s_j, S_i, S_j, tau, m, of two bearings and points, all (3,).
+    """sin alpha, and the (cos, sin, constant) of f, s_i, s_j, S_i, S_j, tau, m, of two bearings and two points.
 
-    Also given are the ``chord`` and the sine of the bound on each bearing's angular error.
-    sin alpha is 0 for a pair that bounds nothing: its bearings are too close, or its points coincide.
+    ``vi`` and ``vj`` (3,) are the bearings, ``pi`` and ``pj`` (3,), m, the points; ``chord_i``, ``chord_j``, ``sin_i``
+    and ``sin_j`` are chord and sine of the bound on each bearing's angular error. sin alpha is 0 for a pair that bounds
+    nothing: its bearings are too close, or its points coincide.
     """
     zero = (0.0, 0.0, 0.0)
     dx, dy, dz = pi[0] - pj[0], pi[1] - pj[1], pi[2] - pj[2]
@@ -165,7 +166,7 @@ def direction_of_turn(turn):
 
 @kernel()
 def yaws_between(lo, hi):
-    """The ``YawInterval`` between two turns less than half a circle apart."""
+    """The ``YawInterval`` between the turns ``lo`` and ``hi``, less than half a circle apart."""
     c0, s0 = direction_of_turn(lo)
     c1, s1 = direction_of_turn(hi)
     c, s = c0 + c1, s0 + s1

@@ -168,7 +168,10 @@ def rotation_of(yaw, a, c, out):
 
 @kernel()
 def has_tilt(matches, lower, upper):
-    """Whether some tilt of a cell, ends ``lower`` (6,) and ``upper`` (6,), is within the gravity bound."""
+    """Whether some tilt of a cell is within the gravity bound of ``matches``, ``PackedMatches``.
+
+    The cell's ends are ``lower`` (6,) and ``upper`` (6,).
+    """
     a = max(lower[TILT_A], -upper[TILT_A], 0.0)
     c = max(lower[TILT_C], -upper[TILT_C], 0.0)
     return np.cos(a) * np.cos(c) >= matches.least_cosine - 1e-15

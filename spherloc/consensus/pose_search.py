@@ -122,7 +122,7 @@ def room_for(count: int) -> Room:
 
 @kernel(error_model="numpy")
 def sort_matches(matches, cell, axis, members, kept, forms, cutoff, reach):
-    """Sort the ``members`` (K,) of ``PackedMatches`` by what a ``cell`` (CELL_SIZE,) explains.
+    """Sort the ``members`` (K,) of ``matches``, ``PackedMatches``, by what a ``cell`` (CELL_SIZE,) explains.
 
     The undecided are written to ``kept``. ``axis`` is the one of c that s takes the place of in this chart, -1 if none.
     Returns how many are surely explained, how many undecided, and how many of these the middle explains; -1 if all
@@ -277,7 +277,8 @@ def _meet(offset, slope, room, low, high):
 def _overlap(forms, a, steps, cutoff, ends):
     """Where along parameter ``a`` more than ``cutoff`` of the linear ``forms`` (K, FORM) may be explained at once.
 
-    The first and the last such place are written to ``ends`` (2,), from -1 to 1. Returns the most at one place.
+    The first and the last such place are written to ``ends`` (2,), from -1 to 1; ``steps`` (CUT_BINS + 1,) is scratch
+    memory. Returns the most at one place.
     """
     fill_vector(steps, 0)
     per_unit = 0.5 * CUT_BINS
@@ -302,8 +303,9 @@ def _overlap(forms, a, steps, cutoff, ends):
 def cut_cell(forms, lower, upper, steps, cutoff, reach):
     """Cut off ends of a cell, ``lower`` and ``upper`` (6,), where no more than ``cutoff`` of ``forms`` are explained.
 
-    The ``forms`` (K, FORM) become those of what is left, and ``reach`` (6,) shrinks with it. Returns the most that may
-    be explained at once, ``cutoff`` or less if nothing is left, and the share of the volume that is left.
+    The ``forms`` (K, FORM) become those of what is left, and ``reach`` (6,) shrinks with it; ``steps`` (CUT_BINS + 1,)
+    is scratch memory. Returns the most that may be explained at once, ``cutoff`` or less if nothing is left, and the
+    share of the volume that is left.
     """
     ends, most, share = np.empty(2), len(forms), 1.0
     for _ in range(CUT_ROUNDS):
@@ -357,11 +359,12 @@ def put_off(left, state, cell_of, bound, narrow):
 
 @kernel()
 def search_poses(matches, cell_of, members, room, limits, found, board):
-    """Split a cell, ``cell_of`` = (chart, lower (6,), upper (6,)), until no part may explain more than the best pose
-    and ``limits.gap``.
+    """Split a cell until no part may explain more than the best pose and ``limits.gap``.
 
-    ``members`` are all that may be explained in it. ``found`` is (best_at, state, left): better poses go to ``best_at``
-    (7,), chart and parameters, and to ``state``; where the effort ends, cells go to ``left``.
+    The cell is ``cell_of`` = (chart, lower (6,), upper (6,)); ``members`` (K,) are all of ``matches``,
+    ``PackedMatches``, that may be explained in it. ``room`` is a ``Room``, ``limits`` are ``Limits``. ``found`` is
+    (best_at, state, left): better poses go to ``best_at`` (7,), chart and parameters, and to ``state``; where the
+    effort ends, cells go to ``left``. A watch's ``board`` can end it too.
     """
     chart, lower, upper = cell_of
     best_at, state, left = found

@@ -23,11 +23,12 @@ WINDOW_MARGIN = 1e-12
 
 @kernel()
 def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
-    """Write final cells of a chart, ``ends`` = (lower (6,), upper (6,)), that together hold it, to ``cells``.
+    """Write final cells of a ``chart``, ``ends`` = (lower (6,), upper (6,)), that together hold it, to ``cells``.
 
-    ``memory`` is (Scratch, yaw bound (B,) that excludes nothing); ``cells`` is (lower (K, 6), upper (K, 6),
-    about (K, 2): rule and bound, at most ``claim``). Returns how many; -1 if there is no room for all, -2 if some cell
-    cannot be bounded by ``claim``.
+    ``matches`` are ``PackedMatches``; ``switch_rad`` is as in ``Limits``. ``memory`` is (Scratch, yaw bound (B,) that
+    excludes nothing); ``cells`` is (lower (K, 6), upper (K, 6), about (K, 2): rule and bound, at most ``claim``).
+    Returns how many; -1 if there is no room for all or a watch's ``board`` ends it, -2 if some cell cannot be bounded
+    by ``claim``.
     """
     scratch, unknown = memory
     _, _, about = cells
@@ -103,7 +104,10 @@ def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
 
 @kernel()
 def _put(cells, used, lower, upper, rule, bound):
-    """Write a final cell, ends (6,), as number ``used`` of ``cells``; returns how many there are."""
+    """Write a final cell, ends ``lower`` and ``upper`` (6,), as number ``used`` of ``cells``; returns the next one.
+
+    ``rule`` and ``bound`` say by what it is bounded, and by how much.
+    """
     lowers, uppers, about = cells
     lowers[used], uppers[used] = lower, upper
     about[used, 0], about[used, 1] = rule, bound

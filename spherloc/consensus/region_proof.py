@@ -76,11 +76,11 @@ class LawsonState(NamedTuple):
 
 @kernel()
 def prove_none(matches, region, everybody, floor, found, board=None):
-    """Whether no level pose of a ``Region`` explains more than ``floor`` of ``everybody`` (K,).
+    """Whether no level pose of a ``region``, ``Region``, explains more than ``floor`` of ``everybody`` (K,).
 
-    These are numbers of ``BoundedMatches``. Returns FOUND, with such a pose in ``found`` (5,), see ``level_pose``,
-    IMPOSSIBLE if there is none, or UNKNOWN; and the effort, tests of a match. A watch's ``board`` can end it as
-    UNKNOWN.
+    These are numbers of ``matches``, ``BoundedMatches``. Returns FOUND, with such a pose in ``found`` (5,), see
+    ``level_pose``, IMPOSSIBLE if there is none, or UNKNOWN; and the effort, tests of a match. A watch's ``board`` can
+    end it as UNKNOWN.
     """
     count = len(everybody)
     spare = count - floor
@@ -129,8 +129,8 @@ def prove_none(matches, region, everybody, floor, found, board=None):
 def _basis(matches, region, everybody, gone, state):
     """Few members, those of largest weight first, that alone cannot be explained; none if no such are found.
 
-    Indices (B,) into ``everybody`` (K,), of which those ``gone`` (K,) are left out. ``state`` is where the iteration on
-    all others ended; its shares are overwritten.
+    Indices (B,) into ``everybody`` (K,), numbers of ``matches``, of which those ``gone`` (K,) are left out. ``state``
+    is where the iteration on all others in the ``region`` ended, a ``LawsonState``; its shares are overwritten.
     """
     count, total = len(everybody), len(everybody) - count_true(gone)
     alone = LawsonState(np.empty(5), np.empty(count), state.shares)
@@ -157,8 +157,8 @@ def _basis(matches, region, everybody, gone, state):
 def _lawson(matches, region, everybody, gone, floor, state, rounds):
     """Lawson's iteration on those of ``everybody`` (K,) not ``gone`` (K,), so many ``rounds`` at most.
 
-    Whether a pose explains more than ``floor`` of everybody, or none all of those not gone. Returns the answer and the
-    rounds.
+    ``matches`` are ``BoundedMatches``, ``region`` is a ``Region``, ``state`` a ``LawsonState``, which moves. Whether a
+    pose explains more than ``floor`` of everybody, or none all of those not gone. Returns the answer and the rounds.
     """
     normal, gradient, step = np.empty((4, 4)), np.empty(4), np.empty(4)
     # Where poses that explain all may be: cos, sin and half width of yaw, and a ball. It shrinks.
@@ -216,7 +216,7 @@ def _shrink(root, room, pose, possible):
 def _reweight(gone, state):
     """Multiply each weight of those not ``gone`` (K,) by the share of the bound that its residual takes.
 
-    Their mean becomes 1.
+    Both are those of ``state``, a ``LawsonState``. The mean weight becomes 1.
     """
     weights, total, left = state.weights, 0.0, 0
     for k in range(len(weights)):
@@ -230,9 +230,10 @@ def _reweight(gone, state):
 
 @kernel()
 def _normal_equations(matches, everybody, possible, state, normal, gradient):
-    """Fill the equations (4, 4) and (4,) of the linear residuals by yaw and by position in camera axes, and the shares.
+    """Fill the equations of the linear residuals by yaw and by position in camera axes, and the shares of ``state``.
 
-    Returns how many of ``everybody`` (K,) the pose explains, the weighted cost, px^2, and the weighted squares of
+    The equations are ``normal`` (4, 4) and ``gradient`` (4,), the state is a ``LawsonState``. Returns how many of
+    ``everybody`` (K,), numbers of ``matches``, the pose explains, the weighted cost, px^2, and the weighted squares of
     bounds and of what the linear residuals neglect among the ``possible`` (7,) poses, see ``_shrink``.
     """
     bearings, bound_px = matches.bearings, matches.bound_px
@@ -265,9 +266,10 @@ def _normal_equations(matches, everybody, possible, state, normal, gradient):
 
 @kernel()
 def search_region(matches, region, everybody, floor, cell_limit, found):
-    """Whether some level pose of a ``Region`` explains more than ``floor`` of ``everybody`` (K,): as ``prove_none``.
+    """Whether some level pose of a ``region``, ``Region``, explains more than ``floor`` of ``everybody`` (K,).
 
-    ``matches`` are ``BoundedMatches``. Returns the answer, and how many cells were looked at, ``cell_limit`` at most.
+    As ``prove_none``, with such a pose in ``found`` (5,). ``matches`` are ``BoundedMatches``. Returns the answer, and
+    how many cells were looked at, ``cell_limit`` at most.
     """
     c0, s0, slack = region.yaws
     ball, order, cells = region.ball, np.empty(len(everybody), np.int64), np.empty((MAX_WAITING, 6))
@@ -322,8 +324,9 @@ def _mean_distance(points, everybody, ball):
 
 @kernel()
 def _excess(matches, k, pose):
-    """Of match ``k`` at a level ``pose`` (5 numbers): what its residual exceeds its bound by, times the distance, px m;
-    the distance along its bearing, and the distance, m.
+    """What the residual of match ``k`` at a level ``pose`` (5,) exceeds its bound by, times the distance, px m.
+
+    And the distance along its bearing, and the distance, m. ``matches`` are ``BoundedMatches``.
     """
     bearings, points, jacobian = matches.bearings, matches.points, matches.pixel_jacobian
     c, s, x, y, z = pose
@@ -338,7 +341,7 @@ def _excess(matches, k, pose):
 
 @kernel()
 def _explained(matches, everybody, pose):
-    """How many of ``everybody`` (K,) a level ``pose`` (5 numbers) explains."""
+    """How many of ``everybody`` (K,), numbers of ``matches``, a level ``pose`` (5,) explains."""
     inliers = 0
     for k in everybody:
         excess, along, distance = _excess(matches, k, pose)
@@ -348,10 +351,10 @@ def _explained(matches, everybody, pose):
 
 @kernel()
 def _may_explain(matches, order, middle, half_yaw, reach, floor):
-    """Whether some pose of a cell might explain more than ``floor`` of ``order`` (K,).
+    """Whether some pose of a cell might explain more than ``floor`` of ``order`` (K,), numbers of ``matches``.
 
-    The cell is ``half_yaw``, rad, and ``reach``, m, around the ``middle`` (5 numbers). Those that it surely does not
-    explain are moved to the front of ``order``, to come first next time.
+    The cell is ``half_yaw``, rad, and ``reach``, m, around the ``middle`` (5,). Those that it surely does not explain
+    are moved to the front of ``order``, to come first next time.
     """
     spare = len(order) - floor
     out = 0

@@ -155,8 +155,9 @@ def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
 def deepest(scratch, count, free, cutoff, yaw_bound):
     """Most of ``count`` intervals over one yaw; where that does not exceed ``cutoff``, a bound on it.
 
-    Yaws where ``yaw_bound`` (B,), for bins of turn, does not exceed ``cutoff`` are left out if bins show that nothing
-    else exceeds it.
+    The intervals are those of ``scratch``, a ``Scratch``; ``free`` of them are the whole circle. Yaws where
+    ``yaw_bound`` (B,), for bins of turn, does not exceed ``cutoff`` are left out if bins show that nothing else exceeds
+    it.
     """
     opened, before = scratch.opened, scratch.before
     bins, depth = _count(scratch, count, free)
@@ -189,8 +190,10 @@ def deepest(scratch, count, free, cutoff, yaw_bound):
 
 @kernel()
 def find_windows(scratch, count, free, cutoff, yaw_bound):
-    """Write windows to ``scratch`` that hold all yaws where the depth, as in ``deepest``, exceeds ``cutoff``; returns
-    how many there are."""
+    """Write windows to ``scratch`` that hold all yaws where the depth exceeds ``cutoff``; returns how many there are.
+
+    The depth and ``count``, ``free`` and ``yaw_bound`` are as in ``deepest``.
+    """
     windows, opened, closed, before = scratch.windows, scratch.opened, scratch.closed, scratch.before
     opening, closing = scratch.opening, scratch.closing
     bins, depth = _count(scratch, count, free)
@@ -219,7 +222,7 @@ def find_windows(scratch, count, free, cutoff, yaw_bound):
 
 @kernel()
 def _bin(turn, bins):
-    """The bin of a turn from 0 to 4."""
+    """The bin, of so many ``bins``, of a ``turn`` from 0 to 4."""
     return min(int(turn * (bins / CIRCLE)), bins - 1)
 
 
@@ -227,7 +230,8 @@ def _bin(turn, bins):
 def _count(scratch, count, free):
     """Count the ends of ``count`` intervals by bin, ``free`` of them being the whole circle.
 
-    Returns how many bins there are, and the depth at the end of the circle.
+    They are those of ``scratch``, a ``Scratch``. Returns how many bins there are, and the depth at the end of the
+    circle.
     """
     starts, ends, opened, closed, before = scratch.starts, scratch.ends, scratch.opened, scratch.closed, scratch.before
     bins = MANY_BINS if count >= MANY else FEW_BINS
@@ -247,10 +251,10 @@ def _count(scratch, count, free):
 
 @kernel()
 def _sort_ends(scratch, count, bins, cutoff):
-    """Sort the ends of ``count`` intervals in deep bins, those that more than ``cutoff`` intervals touch.
+    """Sort the ends of ``count`` intervals in deep ``bins``, those that more than ``cutoff`` intervals touch.
 
-    ``opened`` and ``closed`` become where those of each end in ``opening`` and ``closing``; -1 of other bins, where the
-    depth does not exceed ``cutoff``.
+    All are in ``scratch``, a ``Scratch``: ``opened`` and ``closed`` become where those of each end in ``opening`` and
+    ``closing``; -1 of other bins, where the depth does not exceed ``cutoff``.
     """
     starts, ends, opened, closed, before = scratch.starts, scratch.ends, scratch.opened, scratch.closed, scratch.before
     opening, closing = scratch.opening, scratch.closing
@@ -299,9 +303,9 @@ def _clip_windows(windows, used, cutoff, yaw_bound):
 
 @kernel()
 def _open_window(windows, used, start):
-    """Add a window to the first ``used`` of ``windows`` (W, 2) that starts at a turn; returns how many there are.
+    """Add a window that begins at the turn ``start`` to the first ``used`` of ``windows`` (W, 2).
 
-    Or the last one goes on, if that is near or there is no room for more.
+    Or the last one goes on, if that is near or there is no room for more. Returns how many there are.
     """
     if used > 0 and (start - windows[used - 1, 1] <= MAX_GAP or used == len(windows)):
         return used

@@ -180,7 +180,8 @@ def bounded_rays(bearings, points, eps):
 def _smallest(bearings, points, eps, arcs, covering, yaw, most, board):
     """Pairs (S, 2) in their order, centres (S, 3) and radii (S,), m: the ``most`` smallest balls and some more.
 
-    The arguments are those of ``smallest_balls``; a watch's ``board`` counts the arcs and can end it.
+    ``bearings`` (M, 3), ``points`` (M, 3), m, ``eps`` (M,), rad, ``arcs``, ``covering`` (K,) and ``yaw``, rad, are
+    those of ``smallest_balls``; a watch's ``board`` counts the arcs and can end it.
     """
     rays = bounded_rays(bearings, points, eps)
     pairs, lo, hi = arcs
@@ -219,7 +220,7 @@ def _smallest(bearings, points, eps, arcs, covering, yaw, most, board):
 def _least_squared_radius(i, j, rays, c, s):
     """A lower bound on the squared radius, m^2, of ``ball_of_pair``, whatever its slack, for a fraction of the time.
 
-    ``rays`` are ``BoundedRays``, c and s are cos and sin of the yaw.
+    The pair is ``i`` and ``j`` of ``rays``, ``BoundedRays``; c and s are cos and sin of the yaw.
     """
     vi, vj, pi, pj = rays.bearings[i], rays.bearings[j], rays.points[i], rays.points[j]
     chord_i, chord_j, sine_i, sine_j = rays.chord[i], rays.chord[j], rays.sine[i], rays.sine[j]
@@ -240,7 +241,10 @@ def _least_squared_radius(i, j, rays, c, s):
 
 @kernel()
 def _fill(bearings, points, eps, pairs, yaw, slack, centres, radii):
-    """Write the balls of ``translation_balls`` to ``centres`` (P, 3) and ``radii`` (P,), m."""
+    """Write the balls of ``translation_balls`` to ``centres`` (P, 3) and ``radii`` (P,), m.
+
+    ``bearings``, ``points``, ``eps``, ``pairs`` (P, 2), ``yaw`` and ``slack`` (P,) are as there.
+    """
     rays = bounded_rays(bearings, points, eps)
     c, s = np.cos(yaw), np.sin(yaw)
     for k in range(len(pairs)):
@@ -250,9 +254,9 @@ def _fill(bearings, points, eps, pairs, yaw, slack, centres, radii):
 
 @kernel()
 def ball_of_pair(i, j, rays, yaws, centre):
-    """Radius, m, of the ball of a pair of ``BoundedRays`` for a ``YawInterval``, inf if it bounds nothing.
+    """Radius, m, of the ball of a pair for ``yaws``, a ``YawInterval``; inf if it bounds nothing.
 
-    Its ``centre`` (3,), m, is written.
+    The pair is ``i`` and ``j`` of ``rays``, ``BoundedRays``. Its ``centre`` (3,), m, is written.
     """
     c, s, slack = yaws
     vi, vj, pi, pj = rays.bearings[i], rays.bearings[j], rays.points[i], rays.points[j]
@@ -291,7 +295,7 @@ def _value(wave, c, s):
 
 @kernel(inline="always")
 def _slope(wave, c, s):
-    """The derivative by yaw of a wave (cos, sin, constant)."""
+    """The derivative by yaw of a ``wave`` (cos, sin, constant) where cos and sin of the yaw are ``c`` and ``s``."""
     return wave[1] * c - wave[0] * s
 
 
@@ -303,7 +307,7 @@ def _amplitude(wave):
 
 @kernel(inline="always")
 def _sin2_between(vi, vj):
-    """sin^2 of the angle between two unit vectors (3,), without cancellation for small angles."""
+    """sin^2 of the angle between unit vectors ``vi`` and ``vj`` (3,), without cancellation for small angles."""
     cx = vi[1] * vj[2] - vi[2] * vj[1]
     cy = vi[2] * vj[0] - vi[0] * vj[2]
     cz = vi[0] * vj[1] - vi[1] * vj[0]
@@ -312,7 +316,7 @@ def _sin2_between(vi, vj):
 
 @kernel()
 def _turned_back(v, c, s, axis):
-    """Component ``axis`` of R^T v, v (3,), and of its derivative by yaw."""
+    """Component ``axis`` of R^T v, v (3,), and of its derivative by yaw, whose cos and sin are ``c`` and ``s``."""
     if axis == 0:
         return v[0] * c - v[2] * s, -v[0] * s - v[2] * c
     if axis == 1:
@@ -322,7 +326,10 @@ def _turned_back(v, c, s, axis):
 
 @kernel()
 def pair_ball(matches, yaws, i, j):
-    """The ball of a pair of ``BoundedMatches`` for a ``YawInterval``, (4,): centre and radius, m."""
+    """The ball (4,), centre and radius, m, of matches ``i`` and ``j`` for ``yaws``, a ``YawInterval``.
+
+    ``matches`` are ``BoundedMatches``.
+    """
     rays = BoundedRays(matches.bearings, matches.points, matches.chord, matches.sine)
     ball = np.empty(4)
     ball[3] = ball_of_pair(i, j, rays, yaws, ball[:3])
@@ -331,7 +338,10 @@ def pair_ball(matches, yaws, i, j):
 
 @kernel()
 def may_be_seen(matches, yaws, k, ball):
-    """Whether match ``k`` of ``BoundedMatches`` is explained from somewhere in a ``ball`` (4,) at a yaw of ``yaws``."""
+    """Whether match ``k`` is explained from somewhere in a ``ball`` (4,) at a yaw of ``yaws``, a ``YawInterval``.
+
+    ``matches`` are ``BoundedMatches``.
+    """
     c, s, slack = yaws
     points = matches.points
     x, y, z = points[k, 0] - ball[0], points[k, 1] - ball[1], points[k, 2] - ball[2]
@@ -371,7 +381,8 @@ def star_balls(matches, yaws, everybody, most, alone):
 def apart_balls(matches, yaws, nodes, most):
     """Small balls (B, 4) of disjoint pairs for all sets that leave out less than ``most`` of ``nodes`` (K,).
 
-    One with an infinite radius says that there are not enough pairs.
+    Nodes are numbers of ``matches``, ``BoundedMatches``, seen at ``yaws``, a ``YawInterval``. A ball with an infinite
+    radius says that there are not enough pairs.
     """
     balls, free = np.empty((most, 4)), np.empty(len(nodes), np.bool_)
     fill_matrix(balls, np.inf)

@@ -205,9 +205,9 @@ def _optimize(yaw, translation, matches, bound_px, mask):
 def _search(matches, bound_px, seed, iterations, miss, msac, local, board):
     """Rows (sample, i, j, yaw, translation, inliers, optimized) of all improvements, samples drawn, confidence reached.
 
-    ``matches`` are ``gauss_newton.Matches``, ``bound_px`` (M,), ``seed`` is uint64; ``miss`` is 1 - confidence, or NaN
-    to draw all samples; ``msac`` and ``local`` are switches. Rows (J, 9) are float64. A watch's ``board`` counts the
-    samples and can end it.
+    ``matches`` are ``gauss_newton.Matches``, ``bound_px`` (M,), ``seed`` is uint64; at most ``iterations`` samples are
+    drawn; ``miss`` is 1 - confidence, or NaN to draw them all; ``msac`` and ``local`` are switches. Rows (J, 9) are
+    float64. A watch's ``board`` counts the samples and can end it.
     """
     bearings, points, count = matches.bearings, matches.points, len(matches.points)
     bounded = not np.isnan(miss)

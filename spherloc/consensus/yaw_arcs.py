@@ -140,8 +140,8 @@ def _clear_sign(wave, u0, v0, u1, v1, cosine):
 def _arcs_at_roots(f, tau, most_i, most_j, arcs):
     """Write the arcs where all conditions hold to ``arcs`` (K, 4), if f has two roots and at most a short one at each.
 
-    Returns how many, or -1 where it is not so simple. f, tau and the upper bounds on both depths are waves (cos, sin,
-    constant). Gives what four cuts give, for most pairs, with few branches.
+    Returns how many, or -1 where it is not so simple. ``f``, ``tau`` and the upper bounds on both depths, ``most_i``
+    and ``most_j``, are waves (cos, sin, constant). Gives what four cuts give, for most pairs, with few branches.
     """
     a, b, c = tau[0] - f[0], tau[1] - f[1], tau[2] - f[2]
     d, e, g = tau[0] + f[0], tau[1] + f[1], tau[2] + f[2]
@@ -279,7 +279,7 @@ def _sort(values: FloatArray, watch: Watch) -> None:
 
 @kernel(inline="always")
 def _kind(lo, hi):
-    """Whether an arc, ends in rad, is the whole circle, whether it crosses the seam, and its upper end below pi."""
+    """Whether an arc from ``lo`` to ``hi``, rad, is the whole circle; whether it crosses the seam; its end below pi."""
     full = hi - lo >= 2 * np.pi
     wraps = hi >= np.pi and not full
     return full, wraps, hi - 2 * np.pi if wraps else hi
@@ -305,7 +305,10 @@ def _ends(lo, hi, board):
 
 @kernel()
 def _covering(lo, hi, yaw, board):
-    """Indices (K,) of the arcs, ``lo`` (A,) and ``hi`` (A,), rad, that cover a ``yaw`` of [-pi, pi)."""
+    """Indices (K,) of the arcs, ``lo`` (A,) and ``hi`` (A,), rad, that cover a ``yaw`` of [-pi, pi).
+
+    A watch's ``board`` can end it.
+    """
     covering = np.empty(len(lo), np.int32)
     count = 0
     for k in range(len(lo)):
@@ -329,7 +332,7 @@ def _sweep(starts, ends, depth, overlap, board):
     """Walk the sorted ends from -pi to pi, starting with ``depth`` arcs that cover -pi; fill ``overlap`` (BINS,).
 
     ``starts`` and ``ends`` (K,) are in rad. Returns the longest interval of greatest depth. Where an arc ends and
-    another starts at the same yaw, both cover it, since arcs are closed.
+    another starts at the same yaw, both cover it, since arcs are closed. A watch's ``board`` can end it.
     """
     count = len(starts)
     opened, closed = 0, 0

@@ -75,7 +75,7 @@ def sort_into_bins(
 
 @kernel()
 def _bins(lo, hi):
-    """First and last bin that an arc, ends in turns, touches; not more than all."""
+    """First and last bin that an arc from ``lo`` to ``hi``, turns, touches; not more than all."""
     first, last = int(lo / BIN_TURN), int(hi / BIN_TURN)
     return first, min(last, first + BINS - 1)
 

@@ -40,9 +40,11 @@ def guided_matches(
 
 @kernel(fastmath=True)
 def _search(turned, second, first_words, second_words, t, limits, nearest, ratios):
-    """Write the nearest (N,) of each feature, -1 if there is none, and the ratio (N,) of its distances.
+    """Write the ``nearest`` (N,) of each feature, -1 if there is none, and the ratio of its distances, ``ratios`` (N,).
 
-    ``turned`` (N, 3) and ``second`` (M, 3) are bearings, ``limits`` the sine of the bound and the largest distance.
+    ``turned`` (N, 3) and ``second`` (M, 3) are bearings, ``first_words`` (N, W) and ``second_words`` (M, W)
+    descriptors, ``t`` (3,) the unit direction of the translation, ``limits`` the sine of the bound and the largest
+    distance.
     """
     sine_bound, most_distance = limits
     count, other, size = len(turned), len(second), first_words.shape[1]

@@ -110,7 +110,10 @@ def _yaw(angle: float) -> FloatArray:
 
 @kernel()
 def _normal(a, c, cosine, sine, out):
-    """c x R a."""
+    """Write c x R a to ``out`` (3,).
+
+    ``a`` and ``c`` (3,) are level bearings, ``cosine`` and ``sine`` those of the yaw of R.
+    """
     x, y, z = a[0] * cosine + a[2] * sine, a[1], a[2] * cosine - a[0] * sine
     out[0] = c[1] * z - c[2] * y
     out[1] = c[2] * x - c[0] * z
@@ -119,7 +122,10 @@ def _normal(a, c, cosine, sine, out):
 
 @kernel()
 def _determinant(a, c, sample, yaw, normals):
-    """Of the normals (3, 3), which are written, of three matches of level bearings ``a`` and ``c`` (N, 3) at a yaw."""
+    """The determinant of the ``normals`` (3, 3), which are written, of three matches at a ``yaw``, rad.
+
+    ``a`` and ``c`` (N, 3) are level bearings, ``sample`` (3,) the numbers of the matches.
+    """
     cosine, sine = np.cos(yaw), np.sin(yaw)
     for k in range(3):
         _normal(a[sample[k]], c[sample[k]], cosine, sine, normals[k])
@@ -133,7 +139,10 @@ def _determinant(a, c, sample, yaw, normals):
 
 @kernel()
 def _fits(r, c, t, sine_bound):
-    """Whether bearings r (turned into the second camera) and c fit the unit direction t."""
+    """Whether bearings ``r`` (turned into the second camera) and ``c`` (3,) fit the unit direction ``t`` (3,).
+
+    ``sine_bound`` is the sine of the bound on each one's error.
+    """
     n0, n1, n2 = c[1] * r[2] - c[2] * r[1], c[2] * r[0] - c[0] * r[2], c[0] * r[1] - c[1] * r[0]
     p0, p1, p2 = t[1] * r[2] - t[2] * r[1], t[2] * r[0] - t[0] * r[2], t[0] * r[1] - t[1] * r[0]
     q0, q1, q2 = t[1] * c[2] - t[2] * c[1], t[2] * c[0] - t[0] * c[2], t[0] * c[1] - t[1] * c[0]
@@ -148,14 +157,20 @@ def _fits(r, c, t, sine_bound):
 
 @kernel()
 def _fitting(turned, second, direction, sine_bound, found):
-    """Write to ``found`` (N,) which of the bearings (N, 3) fit."""
+    """Write to ``found`` (N,) which of the bearings ``turned`` and ``second`` (N, 3) fit ``direction``, see ``_fits``.
+
+    ``sine_bound`` is as there.
+    """
     for i in range(len(turned)):
         found[i] = _fits(turned[i], second[i], direction, sine_bound)
 
 
 @kernel()
 def _all_fitting(turned, second, direction, sine_bound):
-    """How many of all pairings of bearings (N, 3) fit."""
+    """How many of all pairings of bearings ``turned`` and ``second`` (N, 3) fit ``direction``, see ``_fits``.
+
+    ``sine_bound`` is as there.
+    """
     count = 0
     for i in range(len(turned)):
         for j in range(len(second)):
@@ -166,7 +181,11 @@ def _all_fitting(turned, second, direction, sine_bound):
 
 @kernel()
 def _search(a, c, samples, bound_rad, log_miss):
-    """Most matches that fit, and the yaw and direction (3,) that they fit."""
+    """Most matches that fit, and the yaw, rad, and direction (3,) that they fit.
+
+    ``a`` and ``c`` (N, 3) are level bearings, ``samples`` (S, 3) the numbers of the matches that are tried together,
+    ``bound_rad`` the bound on a bearing's error, ``log_miss`` the logarithm of 1 - confidence.
+    """
     count, sine_bound = len(a), np.sin(bound_rad)
     normals, turned, t, best_t = np.empty((3, 3)), np.empty(3), np.empty(3), np.zeros(3)
     best, best_yaw, needed = 0, 0.0, float(len(samples))
@@ -219,7 +238,7 @@ def _search(a, c, samples, bound_rad, log_miss):
 
 @kernel()
 def _direction(normals, t):
-    """Write the unit vector that is perpendicular to the normals (3, 3); False if they are nearly parallel."""
+    """Write the unit vector ``t`` (3,) perpendicular to the ``normals`` (3, 3); False if they are nearly parallel."""
     longest = 1e-6
     found = False
     for k in range(3):
@@ -234,7 +253,10 @@ def _direction(normals, t):
 
 @kernel()
 def _in_front(a, c, sample, cosine, sine, normals, t):
-    """Turn t round if that puts all three points in front of both cameras; False if neither does."""
+    """Turn ``t`` (3,) round if that puts all three points in front of both cameras; False if neither does.
+
+    ``a``, ``c``, ``sample``, ``cosine``, ``sine`` and ``normals`` are as in ``_determinant`` and ``_normal``.
+    """
     for turn in range(2):
         right = True
         for k in range(3):

@@ -119,9 +119,10 @@ def _planar_pose(
 
 @kernel()
 def refine_each(basis, points, rotations, translations, exists):
-    """``refine_on_tangents`` of each of B samples that ``exists`` (B,), in place of the poses (B, 3, 3) and (B, 3).
+    """``refine_on_tangents`` of each of B samples that ``exists`` (B,), in place of its pose.
 
-    ``basis`` (B, K, 2, 3), ``points`` (B, K, 3).
+    The poses are ``rotations`` (B, 3, 3) and ``translations`` (B, 3), m; ``basis`` (B, K, 2, 3), ``points`` (B, K, 3),
+    m.
     """
     for sample in range(len(points)):
         if exists[sample]:
@@ -136,7 +137,7 @@ def refine_on_tangents(basis, points, rotation, translation):
     """R (3, 3) and t (3,) with the least sum of (n . u)^2, u the unit vector towards R p + t, by Gauss-Newton.
 
     ``basis`` (K, 2, 3) holds both tangents n of every bearing, ``rotation`` (3, 3) and ``translation`` (3,) are the
-    start. Points (K, 3) must have their mean at the origin: steps turn about it.
+    start. ``points`` (K, 3) must have their mean at the origin: steps turn about it.
     """
     least = np.inf
     turned, moved = rotation, translation

@@ -62,7 +62,10 @@ def p3p(bearings: FloatArray, points: FloatArray) -> tuple[FloatArray, IntArray]
 
 @kernel()
 def _solve_each(bearings, points, poses, found):
-    """Write the poses (K, 4, 3, 4) of K samples (K, 3, 3), (K, 3, 3) and how many each has, ``found`` (K,)."""
+    """Write the ``poses`` (K, 4, 3, 4) of K samples and how many each has, ``found`` (K,).
+
+    ``bearings`` (K, 3, 3) and ``points`` (K, 3, 3) are as in ``p3p``.
+    """
     for k in range(len(bearings)):
         found[k] = solve_triplet(bearings[k], points[k], poses[k])
 
@@ -108,14 +111,14 @@ def solve_triplet(bearings, points, poses):
 
 @kernel()
 def _distance2(points, i, j):
-    """|p_i - p_j|^2 of two rows of ``points`` (3, 3)."""
+    """|p_i - p_j|^2 of rows ``i`` and ``j`` of ``points`` (3, 3)."""
     x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
     return x * x + y * y + z * z
 
 
 @kernel()
 def _dot(bearings, i, j):
-    """v_i . v_j of two rows of ``bearings`` (3, 3)."""
+    """v_i . v_j of rows ``i`` and ``j`` of ``bearings`` (3, 3)."""
     return bearings[i, 0] * bearings[j, 0] + bearings[i, 1] * bearings[j, 1] + bearings[i, 2] * bearings[j, 2]
 
 

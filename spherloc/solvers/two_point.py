@@ -37,7 +37,8 @@ def yaw_coefficients(vi, vj, pi, pj):
 def depths(vi, vj, pi, pj, cosine, sine, sin2):
     """Depths (s_i, s_j), m, with R d = s_i v_i - s_j v_j in the least-squares sense; sin2 = |v_i x v_j|^2.
 
-    ``cosine`` and ``sine`` are those of the yaw; the others are as in ``yaw_coefficients``.
+    ``cosine`` and ``sine`` are those of the yaw; bearings ``vi``, ``vj`` and points ``pi``, ``pj`` (3,) are as in
+    ``yaw_coefficients``.
     """
     dx, dy, dz = pi[0] - pj[0], pi[1] - pj[1], pi[2] - pj[2]
     rx, rz = dx * cosine + dz * sine, dz * cosine - dx * sine
@@ -81,7 +82,10 @@ def solve_pair(vi, vj, pi, pj, yaws, translations):
 
 @kernel()
 def _solve_batch(bearings, points, yaws, translations, valid):
-    """Write ``solve_pair`` of B pairs, see ``two_point``; ``valid`` (B, 2) becomes true where there is a root."""
+    """Write ``solve_pair`` of B pairs, see ``two_point``; ``valid`` (B, 2) becomes true where there is a root.
+
+    ``bearings`` and ``points`` (B, 2, 3) are as there; ``yaws`` (B, 2) and ``translations`` (B, 2, 3) are written.
+    """
     for b in range(len(bearings)):
         found = solve_pair(bearings[b, 0], bearings[b, 1], points[b, 0], points[b, 1], yaws[b], translations[b])
         valid[b, :found] = True
