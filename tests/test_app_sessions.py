@@ -26,12 +26,14 @@ from spherloc_viz.app.compilation import Compilation
 from spherloc_viz.app.server import Sessions
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.session import Session
+from spherloc_viz.app.stage import canvas as canvas_module
+from spherloc_viz.app.stage import views
 from spherloc_viz.app.text import HIDDEN
 from spherloc_viz.app.web.touch import Touch
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.storage.recorder import Ended
-from tests.connected_page import Wire
+from tests.connected_page import HELLO, Wire
 from tests.tiny_scene import write_tiny_scene
 from tests.waiting import LIMIT_S, until
 
@@ -193,6 +195,21 @@ def test_while_another_scene_opens_nothing_stands_under_its_name(house: House) -
     until(lambda: drawn["map/points"][0].visible and not drawn["map/references"][0].visible)
     until(lambda: story._card.content == "" and story._summary.content == shown)
     assert "opacity:.35" not in story._outcome.content
+
+
+def test_a_view_that_a_slow_page_drops_is_set_again(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page reports where its viewer began long after the checks of the first view."""
+    monkeypatch.setattr(canvas_module, "FIRST_CHECKS", 0)
+    monkeypatch.setattr(canvas_module, "MAX_CHECKS", 0)
+    page, session = house.visit()
+    canvas = session._display.canvas
+    until(lambda: session._diagnosed is not None)
+    until(lambda: "Diagnosing" not in session._display.panels._diagnosis.content)
+    assert canvas._looked is not None
+    view, before = canvas._looked[1], canvas._taken_s
+    page.send(HELLO | {"position": views.START})
+    until(lambda: canvas._taken_s > before)
+    until(lambda: views.stands_at(session._client, view))
 
 
 def test_stepping_solves_nothing(house: House, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -260,7 +260,10 @@ class Canvas:
         looked, picture = self._looked, self._picture
         if looked is None or picture is None:
             return
-        if looked[0] != HELD and abs(np.log(self._aspect() / looked[2])) > RESHAPED and self._untouched():
+        if views.stands_at(self._client, views.START):  # a page that was still being built has dropped the view
+            with self._lock:
+                self._take(*looked)
+        elif looked[0] != HELD and abs(np.log(self._aspect() / looked[2])) > RESHAPED and self._untouched():
             with self._lock:
                 self._look(looked[0], picture)
 
