@@ -109,11 +109,28 @@ def test_what_is_wrong_is_a_remark_and_the_rest_is_opened(place: Place, key: str
     others = {"v": "1", "seed": "8", "estimator": "ransac-2p", "step": "bearings"}
     found = place.follower.follow(urlencode({**others, key: value}), place.now, VIEW)
     assert len(found.remarks) == 1 and remark in found.remarks[0], found.remarks
+    if key in ("scene", "place", "run"):
+        assert (found.request, found.view) == (place.now, VIEW), "what is meant for another run was done to this one"
+        return
     assert found.view.step == "bearings"
     assert found.request.estimator == ("mc" if key == "estimator" else "ransac-2p")
-    if key not in ("scene", "place", "seed"):
+    if key != "seed":
         assert found.request.scene.seed == 8
     place.catalog.problem(found.request.scene)
+
+
+def test_a_recording_that_is_gone_is_solved_again_if_the_link_names_its_scene(place: Place) -> None:
+    text = urlencode({"run": "gone.rrd", "scene": place.label, "seed": "8"})
+    found = place.follower.follow(text, place.now, VIEW)
+    assert len(found.remarks) == 1 and found.request.scene == SceneRequest(place.label, 8)
+
+
+def test_a_step_and_matches_that_the_run_does_not_have_are_remarks(place: Place) -> None:
+    found = place.follower.follow("step=sample-9&select=3,77,99", place.now, VIEW)
+    assert found.missing("sample-5", range(50)) == ["the run has no match 77,99, which the link selects."]
+    (step, _) = found.missing("outcome", range(50))
+    assert step == "the run has no step 'sample-9'; the page shows its outcome."
+    assert place.follower.follow("", place.now, VIEW).missing("yaw-clique", range(50)) == []
 
 
 PAIRS = st.lists(st.tuples(st.sampled_from((*ONCE, *MANY)), st.text(max_size=12)), max_size=6)

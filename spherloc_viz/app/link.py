@@ -8,7 +8,7 @@ disk.
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from html import escape
 from typing import Any
@@ -33,6 +33,9 @@ THEMES = ("dark", "light")
 ANSWERS = ("told", "hidden")
 TABS = ("step's", "Yaw", "Graph", "Charts", "Residuals", "Images", "Matches")
 """The tabs of the lower left panel, after the word for the one that goes with the step."""
+SCENE_KEYS = ("scene", "case", "place")
+MAX_NAMED = 5
+"""Most matches that one remark names."""
 LISTS = ("spoil", "mend", "hide")
 """Keys of ``EDITS``, in their order."""
 ONCE = (
@@ -121,6 +124,19 @@ class Followed:
     """One sentence for each part of the link that could not be opened."""
     opened: Opened | None = None
     """The recording that the link names."""
+    step: str | None = None
+    """Key of the step that the link itself names."""
+
+    def missing(self, step: str, matches: Collection[int]) -> list[str]:
+        """One sentence for each thing that the link names and the run does not have: a step, if ``step`` is shown in
+        its place, and selected matches that are not among the numbers ``matches``."""
+        remarks = []
+        if self.step and self.step.split("-")[0] != step.split("-")[0]:
+            remarks.append(f"the run has no step {show(self.step)}; the page shows its outcome.")
+        others = [number for number in self.view.selected if number not in matches]
+        if others:
+            remarks.append(f"the run has no match {_numbers_text(others[:MAX_NAMED])}, which the link selects.")
+        return remarks
 
 
 class Follower:
@@ -143,7 +159,9 @@ class Follower:
         said = _read(text, remarks)
         opened = self._recorded(said, remarks)
         request = self._request(said, now, remarks) if opened is None else opened.request
-        return Followed(request, _view(said, view, opened, remarks), tuple(remarks), opened)
+        if request is None:
+            return Followed(now, view, tuple(remarks))
+        return Followed(request, _view(said, view, opened, remarks), tuple(remarks), opened, said.get("step"))
 
     def _recorded(self, said: dict[str, Any], remarks: list[str]) -> Opened | None:
         """The recording that a link names; if it cannot be opened, the rest of the link is solved."""
@@ -155,9 +173,17 @@ class Follower:
             remarks.append(str(error))
             return None
 
-    def _request(self, said: dict[str, Any], now: RunRequest, remarks: list[str]) -> RunRequest:
-        """What a link asks for."""
-        scene = self._scene(said, now.scene, remarks)
+    def _request(self, said: dict[str, Any], now: RunRequest, remarks: list[str]) -> RunRequest | None:
+        """What a link asks for; None if it names a recording or scene that cannot be opened, and no other scene: the
+        rest of it means nothing for the run that the page shows."""
+        if "run" in said and not any(key in said for key in SCENE_KEYS):
+            return None
+        try:
+            label = self._label(said, now.scene.scene)
+        except SpherlocError as error:
+            remarks.append(str(error))
+            return None
+        scene = self._scene(said, label, remarks)
         estimator = said.get("estimator", now.estimator)
         if estimator not in usable_estimators():
             remarks.append(f"the estimator {show(estimator)} is unknown.")
@@ -171,13 +197,8 @@ class Follower:
         options = self._options(said.get("option", ()), default_options(estimator, problem), estimator, remarks)
         return RunRequest(scene, estimator, options)
 
-    def _scene(self, said: dict[str, Any], now: SceneRequest, remarks: list[str]) -> SceneRequest:
-        """The scene of the link with its changes; the page's own if that of the link cannot be opened."""
-        try:
-            label = self._label(said, now.scene)
-        except SpherlocError as error:
-            remarks.append(str(error))
-            return now
+    def _scene(self, said: dict[str, Any], label: str, remarks: list[str]) -> SceneRequest:
+        """The scene of that label with the link's changes."""
         scene = self._catalog.scenes[label]
         seed = said.get("seed", str(getattr(scene, "seed", 0)))
         if not (seed.isascii() and seed.isdigit() and len(seed) < 20 and int(seed) < 2**63):

@@ -306,15 +306,18 @@ class Session:
         with self._changes.as_of(number):
             self._controls.display.theme = followed.view.theme
             self._controls.display.answers_hidden = followed.view.answers_hidden
+        remarks = list(followed.remarks)
         if self._run is not None:
-            self._edits.select(set(followed.view.selected) & set(self._run.kept.tolist()))
+            kept = set(self._run.kept.tolist())
+            self._edits.select(set(followed.view.selected) & kept)
             key = _step_key(self._run.trace, followed)
+            remarks += followed.missing(key, kept)
             self._display.panels.steps.go(key)
             self._display.panels.open_tab(followed.view.tab)
             if followed.view.viewpoint:
                 self._display.canvas.hold(key, followed.view.viewpoint)
-        if followed.remarks:
-            self.complain(" ".join(remark[:1].upper() + remark[1:] for remark in followed.remarks))
+        if remarks:
+            self.complain(" ".join(remark[:1].upper() + remark[1:] for remark in remarks))
 
     def _view(self) -> PageView:
         """Step, selection, viewer, hidden answers and tab of the page, for its link."""
@@ -345,12 +348,12 @@ class Session:
             finally:
                 self._controls.slow.end()
             run = Run(request, trace, _kept(request, problem))
-            self._run, self._answers = run, number
-            self._page.ask()
+            self._run = run
             self._pictures.want(run)
-        elif self._answers != number:
-            self._answers = number
-            self._page.ask()
+        elif self._answers == number:  # nothing has changed: what a link was refused for stays on the page
+            return QUIET_S
+        self._answers = number
+        self._page.ask()
         self._status.say(self._runs.announce(self._run))
         self._status.withdraw()
         return QUIET_S
