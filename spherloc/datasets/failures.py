@@ -258,6 +258,14 @@ def _bound_too_small(make: CaseMaker) -> FailureCase:
     return make.case("noise bound too small", bound_px=bound)
 
 
+def _bound_too_large(make: CaseMaker) -> FailureCase:
+    """Few matches are right, and the bound is 80 to 150 px: as many wrong ones agree with any pose."""
+    count, inliers = make.whole(150, 300), make.whole(7, 10)
+    make.right(inliers)
+    make.random(count - inliers)
+    return make.case("noise bound too large", bound_px=make.between(80.0, 150.0))
+
+
 def _degenerate(make: CaseMaker) -> FailureCase:
     """Right matches on one pole, at one spot, or too far away to fix the position."""
     count = make.whole(40, 200)
@@ -379,6 +387,7 @@ MAKERS: Mapping[str, Callable[[CaseMaker], FailureCase]] = {
     "ambiguous": _ambiguous,
     "search missed the best pose": _search_missed,
     "map too sparse": _map_too_sparse,
+    "noise bound too large": _bound_too_large,
 }
 
 

@@ -28,6 +28,8 @@ class Cause(StrEnum):
     larger than the noise bound."""
     BOUND_TOO_SMALL = "noise bound too small"
     """Many right matches are beyond the noise bound: within twice the bound there are at least 1.5 times as many."""
+    BOUND_TOO_LARGE = "noise bound too large"
+    """So many wrong matches are within the noise bound that no pose stands out; within a lower bound one does."""
     DEGENERATE = "degenerate geometry"
     """Enough matches agree, but they do not fix the pose to within the errors of a success."""
     ITERATIONS_RAN_OUT = "iterations ran out"

@@ -12,12 +12,14 @@ from spherloc.diagnosis.evidence import (
     WIDER,
     Evidence,
     Fit,
+    Narrow,
     Truth,
     certify,
     different,
     gather,
     gather_truth,
     measures_of,
+    narrow_fit,
 )
 from spherloc.diagnosis.words import describe
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
@@ -62,8 +64,12 @@ def diagnose(trace: Trace, use_truth: bool = True) -> Diagnosis:
     cause = without_truth(evidence) if truth is None else with_truth(evidence, truth)
     if cause is Cause.ITERATIONS_RAN_OUT and trace.stage(RansacStage) is None:
         cause = Cause.SEARCH_MISSED
+    narrow = narrow_fit(trace) if cause in (Cause.TOO_FEW_INLIERS, Cause.WRONG_REFERENCE) else None
+    if narrow is not None and believes(narrow, truth):
+        cause = Cause.BOUND_TOO_LARGE
     certificate = certify(trace) if cause in TO_BE_PROVEN else trace.certificate
-    return replace(describe(trace, evidence, truth, cause, certificate), measures=measures_of(evidence, certificate))
+    diagnosis = describe(trace, evidence, truth, cause, certificate, narrow)
+    return replace(diagnosis, measures=measures_of(evidence, certificate))
 
 
 def without_truth(e: Evidence) -> Cause:
@@ -128,6 +134,12 @@ def with_truth(e: Evidence, t: Truth) -> Cause:
 def stands_out(e: Evidence, size: int, wider: float = 1.0) -> bool:
     """Whether a consensus of that size, within ``wider`` times the noise bound, is more than chance explains."""
     return size >= MIN_SUPPORT and e.nfa(size, wider) < MAX_NFA
+
+
+def believes(narrow: Narrow, truth: Truth | None) -> bool:
+    """Whether the pose within a lower bound is more than chance explains and, where the truth is known, right."""
+    wrong = truth is not None and different(narrow.fit.cam_from_map, truth.exact.cam_from_map)
+    return narrow.fit.support(narrow.bound_px) >= MIN_SUPPORT and narrow.nfa < MAX_NFA and not wrong
 
 
 def map_is_sparse(e: Evidence, right: int) -> bool:

@@ -3,6 +3,7 @@ The decision itself is in ``decide``. Poses are between the aligned frames.
 """
 
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -177,6 +178,36 @@ def free_fit(aligned: AlignedProblem, starts: list[FloatArray], bound_px: float)
             start = refine(free, start, bounds_of(free, float(level)), options)[0]
         fits.append(fit_of(aligned, start))
     return max(fits, key=lambda fit: fit.support(wide), default=None)
+
+
+NARROWER = 4.0
+"""Ratio of one bound to the next lower one that is tried ..."""
+NOISE_SDS = 3.0
+"""... down to this many standard deviations of the noise: a lower one would take right matches out."""
+
+
+class Narrow(NamedTuple):
+    """A pose within a lower noise bound than the run's."""
+
+    bound_px: float
+    """The lower bound."""
+    fit: Fit
+    """The pose with the most support within it."""
+    nfa: float
+    """Expected number of sets as large within the lower bound by chance."""
+
+
+def narrow_fit(trace: Trace) -> Narrow | None:
+    """Of poses found within lower noise bounds than the run's, the one that chance explains least; None if the run's
+    bound is not clearly above the noise."""
+    aligned, options = trace.problem.aligned, trace.options
+    bound_px, found = float(options.bound_px) / NARROWER, []
+    while bound_px >= NOISE_SDS * options.noise_px:
+        if (cam_from_map := search(aligned, bound_px, options)) is not None:
+            fit, rate = fit_of(aligned, cam_from_map), chance_rate(aligned.bearings, bounds_of(aligned, bound_px).radians)
+            found.append(Narrow(bound_px, fit, nfa(len(aligned.points), fit.support(bound_px), rate)))
+        bound_px /= NARROWER
+    return min(found, key=lambda narrow: narrow.nfa, default=None)
 
 
 LOOSE_ENDS = 2

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from spherloc.diagnosis.causes import Cause, Diagnosis
-from spherloc.diagnosis.evidence import MISSED, STRONG, Evidence, Fit, Truth, apart, different
+from spherloc.diagnosis.evidence import MISSED, STRONG, Evidence, Fit, Narrow, Truth, apart, different
 from spherloc.metrics import evaluate
 from spherloc.trace import Certificate, ConsensusStage, RansacStage, Trace
 
@@ -17,6 +17,7 @@ ADVICE = {
     Cause.MAP_TOO_SPARSE: "Give the references depth, or more points to the map where the query looks.",
     Cause.GRAVITY_OFF: "Correct the known roll and pitch, or state a larger gravity bound and standard deviation.",
     Cause.BOUND_TOO_SMALL: "Raise bound_px to about three standard deviations of the noise, or calibrate better.",
+    Cause.BOUND_TOO_LARGE: "Lower bound_px to about three standard deviations of the noise.",
     Cause.DEGENERATE: "Add matches elsewhere in the image and at other depths; until then do not trust the pose.",
     Cause.ITERATIONS_RAN_OUT: "Raise the iterations, set a confidence, or use mc-exact.",
     Cause.SEARCH_MISSED: "Use mc-exact, which looks at all poses.",
@@ -26,14 +27,23 @@ ADVICE = {
 
 
 def describe(
-    trace: Trace, e: Evidence, truth: Truth | None, cause: Cause, certificate: Certificate | None
+    trace: Trace,
+    e: Evidence,
+    truth: Truth | None,
+    cause: Cause,
+    certificate: Certificate | None,
+    narrow: Narrow | None,
 ) -> Diagnosis:
-    """The diagnosis of a run whose cause is known."""
-    other = _other(e, truth, cause)
+    """The diagnosis of a run whose cause is known; ``narrow`` is the pose within a lower bound, if one was searched."""
+    if cause is Cause.BOUND_TOO_LARGE and narrow is not None:
+        other, summary = narrow.fit, _narrow_summary(e, narrow)
+    else:
+        other = _other(e, truth, cause)
+        summary = _summary(e, truth, cause, other, trace.problem.unit)
     return Diagnosis(
         cause=cause,
         doubtful=cause is not Cause.OK,
-        summary=_summary(e, truth, cause, other, trace.problem.unit),
+        summary=summary,
         evidence=tuple(_sentences(trace, e, truth, certificate)),
         advice=_advice(trace, e, truth, cause),
         used_truth=truth is not None,
@@ -86,7 +96,7 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
     run, best, second = (0 if fit is None else fit.support(bound) for fit in (e.run, e.best, other))
     match cause:
         case Cause.OK:
-            return f"{run} of {total} matches agree within {bound:.3g} px, {_compared(e, truth, run)}."
+            return f"{run} of {total} matches agree within {_px(bound)}, {_compared(e, truth, run)}."
         case Cause.TOO_FEW_INLIERS if truth is not None:
             return f"Only {np.count_nonzero(truth.right)} of {total} matches are right, no more than chance gives."
         case Cause.TOO_FEW_INLIERS:
@@ -108,6 +118,15 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
         case Cause.UNKNOWN:
             return f"The pose is off the true one, though {run} of {total} matches agree with it and fix it well."
     return _measured_summary(e, truth, cause, unit)
+
+
+def _narrow_summary(e: Evidence, narrow: Narrow) -> str:
+    best = 0 if e.best is None else e.best.support(e.bound_px)
+    return (
+        f"Within {_px(e.bound_px)} no pose explains more matches than chance gives (the best {best} of "
+        f"{len(e.aligned.points)}); within {_px(narrow.bound_px)} one that {narrow.fit.support(narrow.bound_px)} "
+        "agree with stands out."
+    )
 
 
 def _compared(e: Evidence, truth: Truth | None, run: int) -> str:
@@ -143,7 +162,7 @@ def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause, unit: str)
     one, two = (int(np.count_nonzero(errors <= factor * e.bound_px)) for factor in (1, 2))
     where = "" if truth is None else "at the true pose, " if fit is truth.exact else "near the true pose, "
     return (
-        f"The noise exceeds the bound: {where}{one} matches are within its {e.bound_px:.3g} px, {two} within twice as "
+        f"The noise exceeds the bound: {where}{one} matches are within its {_px(e.bound_px)}, {two} within twice as "
         "much."
     )
 
@@ -154,17 +173,17 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
         yield "The run has no pose."
     else:
         support, counted = e.run.support(bound), int(np.count_nonzero(trace.inlier_mask))
-        yield f"{support} of {total} matches agree with the run's pose within {bound:.3g} px."
+        yield f"{support} of {total} matches agree with the run's pose within {_px(bound)}."
         if counted != support:
             yield f"The run counts {counted}, within a bound that allows for the error of gravity too."
     if e.best is not None:
         best = e.best.support(bound)
         if e.run is None or best > e.run.support(bound):
             yield f"A longer search finds a pose that {best} agree with."
-        yield f"Sets of {best} that agree by chance: {_expected(e.nfa(best))} expected."
         if np.isfinite(e.position_sd_m):
             fixed = f"{_distance(e.position_sd_m, trace.problem.unit)} and {_deg(e.rotation_sd_rad)}"
-            yield f"They fix it to {fixed} (1 sd)."
+            yield f"The {best} fix their pose to {fixed} (1 sd)."
+        yield f"Sets of {best} that agree by chance: {_expected(e.nfa(best))} expected."
     if e.best is not None and e.alternative is not None and e.alternative.support(bound) > 1:
         turn, distance = apart(e.best.cam_from_map, e.alternative.cam_from_map)
         away = f"{_distance(distance, trace.problem.unit)} and {_deg(turn)}"
@@ -208,6 +227,10 @@ def _truths(trace: Trace, e: Evidence, truth: Truth) -> Iterator[str]:
 
 def _deg(angle_rad: float) -> str:
     return f"{np.degrees(angle_rad):.2g}°" if angle_rad < 1.7 else f"{np.degrees(angle_rad):.0f}°"
+
+
+def _px(size_px: float) -> str:
+    return f"{size_px:.3g} px" if size_px < 1000 else f"{size_px:.0f} px"
 
 
 def _distance(distance: float, unit: str) -> str:

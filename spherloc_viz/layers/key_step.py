@@ -18,6 +18,7 @@ from spherloc_viz.layers.primitives import Picture, Points
 BY_CAUSE: dict[Cause, tuple[str, ...]] = {
     Cause.GRAVITY_OFF: ("gravity",),
     Cause.BOUND_TOO_SMALL: ("refinement-outliers",),
+    Cause.BOUND_TOO_LARGE: ("refinement-outliers",),
     Cause.DEGENERATE: ("refinement-error",),
     Cause.AMBIGUOUS: ("consensus-poses",),
     Cause.FALSE_CONSENSUS: ("consensus-poses",),
