@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from spherloc.bounds import bounds_of
-from spherloc.consensus.chance import chance_rate
+from spherloc.consensus.chance import chance_rate, expected_text
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.evidence import FEW, LOOSE_ENDS, different, pose_sd
@@ -110,8 +110,8 @@ def _judge(trace: Trace) -> Judgement:
 def _chance_margin(count: int, size: int, rate: float, fixed_by: int) -> tuple[float, str]:
     expected = max(expected_by_chance(count, size, rate, fixed_by), 1e-300)
     margin = np.log10(MAX_NFA) - np.log10(min(expected, 1e300))
-    many = f"{expected:.1g}" if expected < 1e6 else "millions"
-    return margin, f"Only {size} different matches agree with it; {many} such sets are expected by chance."
+    many = f"{expected_text(expected)}{' of' if expected >= 1e6 else ''} such sets"
+    return margin, f"Only {size} different matches agree with it; {many} are expected by chance."
 
 
 def _alternative_margin(

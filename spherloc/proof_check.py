@@ -39,6 +39,9 @@ class Refused(Exception):  # noqa: N818
 def check(path: Path) -> str:
     """The proven statement as a sentence; raises ``Refused`` if the proof does not hold."""
     try:
+        with path.open("rb") as opened:
+            if not zipfile.is_zipfile(opened):
+                raise ValueError("it is no NPZ file")
         with np.load(path, allow_pickle=False) as file:
             proof: Arrays = {name: file[name] for name in file.files}
         return _check(proof)

@@ -27,6 +27,15 @@ def chance_rate(bearings: FloatArray, bound_rad: FloatArray) -> float:
     return float(min(1.0, density * cap))
 
 
+def expected_text(sets: float) -> str:
+    """An expected number of sets by chance in words, to one digit."""
+    if sets < 1e-6:
+        return "practically none"
+    if sets >= 1e6:
+        return "millions"
+    return f"{sets:.1g}" if sets < 1.0 else f"{float(f'{sets:.1g}'):,.0f}"
+
+
 def least_size(count: int, rate: float, expected: float) -> int:
     """The least size whose NFA is at most ``expected``: see ``nfa``."""
     return next((size for size in range(2, count) if nfa(count, size, rate) <= expected), count)

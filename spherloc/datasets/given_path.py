@@ -83,6 +83,8 @@ def _folder(path: Path) -> tuple[str, str]:
     if suffixes[".rrd"]:
         return _counted(suffixes[".rrd"], "recording"), f"list them with: spherloc runs {_quoted(path)}"
     images = _images(names)
+    if images == 1:
+        return _counted(images, "image"), "a map takes two images or more: add some to it"
     if images:
         return _counted(images, "image"), f"make a map of it with: spherloc map {_quoted(path)}"
     inside = images_in_folders(path, names)

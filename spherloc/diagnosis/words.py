@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from spherloc.consensus.chance import expected_text
 from spherloc.diagnosis.causes import Cause, Diagnosis
 from spherloc.diagnosis.evidence import MISSED, STRONG, Evidence, Fit, Narrow, Truth, apart, different
 from spherloc.metrics import evaluate
@@ -183,7 +184,7 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
         if np.isfinite(e.position_sd_m):
             fixed = f"{_distance(e.position_sd_m, trace.problem.unit)} and {_deg(e.rotation_sd_rad)}"
             yield f"The {best} fix their pose to {fixed} (1 sd)."
-        yield f"Sets of {best} that agree by chance: {_expected(e.nfa(best))} expected."
+        yield f"Sets of {best} that agree by chance: {expected_text(e.nfa(best))} expected."
     if e.best is not None and e.alternative is not None and e.alternative.support(bound) > 1:
         turn, distance = apart(e.best.cam_from_map, e.alternative.cam_from_map)
         away = f"{_distance(distance, trace.problem.unit)} and {_deg(turn)}"
@@ -236,6 +237,3 @@ def _px(size_px: float) -> str:
 def _distance(distance: float, unit: str) -> str:
     return f"{distance:.2g} {unit}" if distance < 100 else f"{distance:.0f} {unit}"
 
-
-def _expected(sets: float) -> str:
-    return "practically none" if sets < 1e-6 else f"{sets:.1g}" if sets < 1e6 else "millions"

@@ -4,15 +4,36 @@ import typing
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
 from spherloc.errors import InputError, show
 
+T = TypeVar("T", int, float)
+
+
+def _number(kind: Callable[[str], T], metavar: str, words: str) -> tyro.constructors.PrimitiveConstructorSpec[T | None]:
+    """How an optional number is read, so that a wrong one is called by what it should be."""
+
+    def read(given: list[str]) -> T | None:
+        try:
+            return kind(given[0])
+        except ValueError:
+            raise ValueError(f"{show(given[0])} is not {words}") from None
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=read,
+        is_instance=lambda value: value is None or isinstance(value, int | float),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
-OptionalNumber = Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")]
-OptionalFloat = Annotated[float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="")]
+OptionalNumber = Annotated[int | None, _number(int, "INT", "a whole number"), tyro.conf.arg(help_behavior_hint="")]
+OptionalFloat = Annotated[float | None, _number(float, "FLOAT", "a number"), tyro.conf.arg(help_behavior_hint="")]
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 """Types of optional flags, whose help would otherwise list None beside the type."""
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]

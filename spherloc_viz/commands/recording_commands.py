@@ -37,7 +37,7 @@ def runs(
     /,
     *,
     failed: Flag = False,
-    doubtful: Flag = False,
+    suspect: Flag = False,
     outcome: OptionalText = None,
     diagnosis: OptionalText = None,
     estimator: OptionalText = None,
@@ -78,7 +78,7 @@ def runs(
     Args:
         folder: Folder of the recordings.
         failed: Only runs that are known to have failed.
-        doubtful: Only runs whose diagnosis speaks against their pose, also where the truth is not known.
+        suspect: Only runs whose diagnosis names a cause, also where the truth is not known.
         outcome: success, failure or unknown (there is no truth).
         diagnosis: A diagnosis or a part of its name, such as false-consensus; a wrong one lists them all.
         estimator: An estimator, such as mc.
@@ -115,7 +115,7 @@ def runs(
         estimator=estimator,
         outcome=listing.outcome_of(outcome, failed),
         diagnosis=None if diagnosis is None else listing.diagnosis_of(diagnosis),
-        doubtful=doubtful or None,
+        doubtful=suspect or None,
         label=label,
         source=listing.source_of(source),
         outlier_rate=within(outliers),

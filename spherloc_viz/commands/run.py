@@ -220,7 +220,8 @@ def as_record(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | 
         "outcome": judged.outcome,
         "doubts": judged.reasons if pose is not None else (),
         "certificate": None if certificate is None else asdict(certificate) | proven,
-        "diagnosis": asdict(diagnosis),
+        # Without "doubtful", which is the word for an outcome: the cause is "ok" or speaks against the pose.
+        "diagnosis": {name: value for name, value in asdict(diagnosis).items() if name != "doubtful"},
         "recording": None if recording is None else str(recording),
     }
 

@@ -23,7 +23,7 @@ def filled(folder, *names):
             ["left/1.png", "right/1.png", "scene.toml"],
             "is a folder without images, but with 2 in the folders in it; make a map of them with: spherloc ",
         ),
-        (["1.png"], "is a folder of 1 image; make a map"),
+        (["1.png"], "is a folder of 1 image; a map takes two images or more: add some to it"),
         (["cameras.bin", "images.bin", "points3D.bin", "frames.bin"], "is a COLMAP model; a scene of kind colmap"),
         (["sensors/sensors.txt"], "is a dataset of kapture"),
         (["results.jsonl", "trajectory.png"], "is a folder of results of spherloc localize; list its runs with"),

@@ -26,7 +26,7 @@ COLUMNS = {
     "source": ("source", "Who ran it"),
     "title": ("title", "Of a curated case"),
     "units": ("units", "m, or units where the map's scale is unknown"),
-    "doubtful": ("doubtful", "Whether the diagnosis speaks against the pose"),
+    "doubtful": ("suspect", "Whether the diagnosis names a cause, by the truth where that is known"),
     "proven": ("proven", "Whether the certificate has no gap"),
     "labels": ("labels", "Words of a reviewer"),
     "created": ("time of day", "When it was recorded"),

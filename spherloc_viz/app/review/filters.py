@@ -39,6 +39,8 @@ SORTS: Mapping[str, str] = {
 """What runs are sorted by, and what it is called."""
 JUDGED = ("doubtful",)
 """What the diagnosis says of a run, also where the truth is not known."""
+SUSPECT = "Runs whose diagnosis names a cause, by the truth where that is known; such a run may have been localized"
+"""What the filter of ``JUDGED`` finds, said under a resting pointer."""
 FILTERS = (*EXACT, "judged", "outliers", "when")
 UNTOLD, UNTOLD_SORTS = ("estimator", "scene", "source", "when"), ("created", "name")
 """Filters and orders that give no outcome away."""
@@ -172,7 +174,8 @@ def filters_html(look: Look, counts: Counts, hidden: bool = False) -> str:
         if outcomes.get(value, 0) or look.outcome == value
     ]
     if counts.doubtful or look.judged:
-        chips.append(_chip("judged", "doubtful", "doubtful", counts.doubtful, look.judged))
+        words = f'suspect <span style="{DIM}">{counts.doubtful:,}</span>'
+        chips.append(pill(words, f"runs-filter:judged:{JUDGED[0]}", look.judged == JUDGED[0], SUSPECT))
     if counts.pages:
         hint = f"Runs that pages made by themselves; the newest {PAGE_KEPT} are stored, and those that you keep"
         number = f'<span style="{DIM}">{counts.pages:,}</span>'
