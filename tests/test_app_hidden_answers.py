@@ -85,3 +85,10 @@ def test_no_tab_tells_hidden_answers(office: Office) -> None:
     until(lambda: told(visitor) == [])
     visitor.set(controls.display._hide, False)
     until(lambda: len(told(visitor)) > 10)
+
+    # At the last step the outcome is shown: there the truth is all that is hidden.
+    visitor.set(controls.display._hide, True)
+    session._display.panels.steps.go("outcome")
+    until(lambda: WITHHELD in controls.compare._table.content and told(visitor))
+    visitor.touch("reveal:truth")
+    until(lambda: WITHHELD not in controls.compare._table.content)

@@ -145,18 +145,20 @@ class RunDisplay:
         """
         controls, known = self.controls, run
         withheld = presenter | self.withheld(run)
-        hidden, blank = bool(withheld), run
-        if hidden:
-            (run, blank), diagnosis = self._untold(run, withheld), None
+        blank = run
+        if withheld:
+            run, blank = self._untold(run, withheld)
         trace = run.trace
         timeline = steps(trace)
         index, pause = self.panels.steps.advance(timeline, asked)
         picture, last = paint(trace, index), index == len(timeline) - 1
+        early = "outcome" in withheld and not last
+        withheld -= {"outcome"} if last else frozenset()
+        hidden = bool(withheld)  # at the last step with the truth shown, nothing is
+        diagnosis = None if hidden else diagnosis
         alternative = None if diagnosis is None else diagnosis.alternative_cam_from_map
         if last and alternative is not None:
             picture = with_alternative(picture, trace, alternative)
-        early = "outcome" in withheld and not last
-        withheld -= {"outcome"} if last else frozenset()
         drawn = with_selection(picture, trace, selected)
         drawn = replace(drawn, scene=drawn.scene + controls.items(known, hidden))
         self._shown = known, mesh, drawn
