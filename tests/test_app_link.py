@@ -101,8 +101,8 @@ def test_a_scene_of_an_allowed_folder_is_opened_again(place: Place) -> None:
         ("view", "0,0,0,0,0,0,45", "view is"),
         ("view", "1,2,nan,0,0,0,45", "view is"),
         ("view", "1,2,3,0,0,0,999", "view is"),
-        ("theme", "pink", "theme is 'pink'; it is dark or light."),
-        ("tab", "Play", "tab is 'Play'; it is step's or Yaw or Graph"),
+        ("theme", "pink", "theme is 'pink'; give dark or light."),
+        ("tab", "Play", "tab is 'Play'; give Yaw, Graph, "),
     ],
 )
 def test_what_is_wrong_is_a_remark_and_the_rest_is_opened(place: Place, key: str, value: str, remark: str) -> None:

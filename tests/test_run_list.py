@@ -83,7 +83,7 @@ def test_runs_are_filtered_sorted_and_printed(folder: Path, capsys: pytest.Captu
     assert errors[-1] == "" and [float(e) for e in errors[:-1]] == sorted(float(e) for e in errors[:-1])
     assert runs(folder, until="2020-01-01") == 0
     captured = capsys.readouterr()
-    assert captured.out == "" and "no run matches; there are 4 runs" in captured.err
+    assert captured.out == "" and "no run matches, of 4 runs" in captured.err
 
 
 def test_forms_say_the_same(folder: Path, capsys: pytest.CaptureFixture[str]):

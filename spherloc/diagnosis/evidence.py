@@ -204,7 +204,8 @@ def narrow_fit(trace: Trace) -> Narrow | None:
     bound_px, found = float(options.bound_px) / NARROWER, []
     while bound_px >= NOISE_SDS * options.noise_px:
         if (cam_from_map := search(aligned, bound_px, options)) is not None:
-            fit, rate = fit_of(aligned, cam_from_map), chance_rate(aligned.bearings, bounds_of(aligned, bound_px).radians)
+            fit = fit_of(aligned, cam_from_map)
+            rate = chance_rate(aligned.bearings, bounds_of(aligned, bound_px).radians)
             found.append(Narrow(bound_px, fit, nfa(len(aligned.points), fit.support(bound_px), rate)))
         bound_px /= NARROWER
     return min(found, key=lambda narrow: narrow.nfa, default=None)

@@ -236,4 +236,3 @@ def _px(size_px: float) -> str:
 
 def _distance(distance: float, unit: str) -> str:
     return f"{distance:.2g} {unit}" if distance < 100 else f"{distance:.0f} {unit}"
-

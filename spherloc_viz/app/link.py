@@ -315,7 +315,8 @@ def _one_of(said: dict[str, Any], key: str, words: tuple[str, ...], remarks: lis
     """The value of a key that takes one of ``words``; without it, the first of them."""
     word = said.get(key, words[0])
     if word not in words:
-        remarks.append(f"{key} is {show(word)}; it is {' or '.join(words)}.")
+        known = [known for known in words if known != TABS[0]]
+        remarks.append(f"{key} is {show(word)}; give {', '.join(known[:-1])} or {known[-1]}.")
         return words[0]
     return word
 

@@ -38,6 +38,7 @@ from spherloc_viz.app.run_display import Places, RunDisplay
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Notices, Status
+from spherloc_viz.app.text import begun
 from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks, is_linked, update_widget
 from spherloc_viz.app.workers import Job, LatestWorker
@@ -317,7 +318,7 @@ class Session:
             if followed.view.viewpoint:
                 self._display.canvas.hold(key, followed.view.viewpoint)
         if remarks:
-            self.complain(" ".join(remark[:1].upper() + remark[1:] for remark in remarks))
+            self.complain(" ".join(begun(remark) for remark in remarks))
 
     def _view(self) -> PageView:
         """Step, selection, viewer, hidden answers and tab of the page, for its link."""

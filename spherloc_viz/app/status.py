@@ -8,7 +8,7 @@ import viser
 
 from spherloc.errors import SpherlocError
 from spherloc_viz.app.review.filters import keep_html
-from spherloc_viz.app.text import status_html
+from spherloc_viz.app.text import begun, status_html
 from spherloc_viz.app.web.viser_internals import update_widget
 
 log = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ class Status:
 
     def complain(self, sentence: str) -> None:
         """Show one sentence about what went wrong; the page keeps its last run and stays usable."""
-        sentence = sentence[:1].upper() + sentence[1:]
+        sentence = begun(sentence)
         with self._lock:
             self._line.content = _line_html(sentence, wrong=True)
             if self._complaint is not None:

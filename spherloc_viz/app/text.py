@@ -21,6 +21,11 @@ WORDS = {"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUT
 """Values of a table that are shown in colour."""
 
 
+def begun(sentence: str) -> str:
+    """With a capital letter, unless it begins with the name of a file."""
+    return sentence[:1].upper() + sentence[1:] if sentence.partition(" ")[0].isalpha() else sentence
+
+
 def box(content: str, css: str = "") -> str:
     """A block with the page's margins and type size, which grows on a wide screen (``touch.css``)."""
     return f'<div class="words" style="padding:0 .8em .6em;font-size:13px;line-height:1.4;{css}">{content}</div>'

@@ -55,7 +55,7 @@ def print_runs(folder: Path, query: RunQuery, group: str | None, limit: int | No
         found = index.find(query, most)
         print(rows_text(folder, found.rows, form), end="", flush=True)
         if not found.total:
-            say(f"no run matches; there are {_count(index.find(RunQuery(), 1).total, 'run')} in {folder}.")
+            say(f"no run matches, of {_count(index.find(RunQuery(), 1).total, 'run')} in {folder}.")
         elif len(found.rows) < found.total:
             say(f"{len(found.rows):,} of {found.total:,} runs; --limit 0 shows all.")
     return 0

@@ -34,6 +34,13 @@ def plans(view: RunView, stage: RefinementStage) -> list[Plan]:
     return out
 
 
+RISEN = 1.001
+"""Ratio of errors from which on it is said why the error has grown."""
+SEVERAL_FITS = (
+    "That error has grown: several fits follow one another, and this one has other matches or weights than the last."
+)
+
+
 def _state(view: RunView, stage: RefinementStage, k: int) -> Frame:
     """One of the states, and how it moved since the one before."""
     state, count = view.aligned_pose(stage.cam_from_map[k]), len(stage.cost_px2)
@@ -46,6 +53,8 @@ def _state(view: RunView, stage: RefinementStage, k: int) -> Frame:
         away, turned = translation_error_m(before, state), rotation_error_deg(before, state)
         angle = f"{turned:.3f}°" if turned >= 5e-4 else "less than 0.001°"
         moved = f"The step moved the camera by {view.length(away)} and turned it by {angle}."
+        if rms[k] > RISEN * rms[k - 1]:
+            moved += f" {SEVERAL_FITS}"
     note = "" if count <= MAX_STATES else f"{MAX_STATES} of {count} states are shown, evenly."
     mask = _explained(view, stage, k, state)
     return Frame(

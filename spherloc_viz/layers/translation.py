@@ -357,7 +357,7 @@ def _note(balls: BallSet, shown: IntArray, inside: np.ndarray) -> str:
         )
     solid = np.count_nonzero(balls.solid(drawn, inside))
     if solid < len(drawn):
-        parts.append(f"{solid} balls have a surface, the others their level circle.")
+        parts.append(f"{solid} {'has' if solid == 1 else 'have'} a surface, the others their level circle.")
     return " ".join(parts)
 
 

@@ -18,7 +18,7 @@ from spherloc.trace import Trace
 from spherloc.watch import Cancelled, Watch
 from spherloc_viz import style
 from spherloc_viz.app.plots.charts import chart_svg
-from spherloc_viz.app.text import DIM, WITHHELD, WORDS, box, dot_html, status_html
+from spherloc_viz.app.text import DIM, WITHHELD, WORDS, begun, box, dot_html, status_html
 from spherloc_viz.app.web.touch import Touch, Touches, seen_views
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.layers.comparison import (
@@ -233,7 +233,7 @@ class ComparePanel:
         self._status.content, self._status.visible = status_html(words), True
 
     def _complain(self, sentence: str) -> None:
-        self._status.content = status_html(sentence[:1].upper() + sentence[1:], wrong=True)
+        self._status.content = status_html(begun(sentence), wrong=True)
         self._status.visible = True
 
     def _publish(self, entries: tuple[Entry, ...]) -> None:

@@ -16,7 +16,7 @@ from spherloc.errors import InputError
 from spherloc.trace import Trace
 from spherloc_viz.app.glossary import heading_html
 from spherloc_viz.app.stage.still_page import Still, still_html, viewpoint
-from spherloc_viz.app.text import DIM, box, status_html
+from spherloc_viz.app.text import DIM, begun, box, status_html
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.layers.primitives import SceneItem
 from spherloc_viz.recording.content.writer import write_recording
@@ -141,7 +141,7 @@ class ExportPanel:
         self._status.content, self._status.visible = status_html(words), True
 
     def _complain(self, sentence: str) -> None:
-        self._status.content = status_html(sentence[:1].upper() + sentence[1:], wrong=True)
+        self._status.content = status_html(begun(sentence), wrong=True)
         self._status.visible = True
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import viser
 
-from spherloc_viz.app.text import box, status_html
+from spherloc_viz.app.text import begun, box, status_html
 
 MODULE = "spherloc_viz.commands.map"
 MAX_LETTERS = 20_000
@@ -75,7 +75,7 @@ class MapPanel:
             self._say("Stopped; what was done is kept for the next time.")
         else:
             sentence = str(said.get("error", "the map could not be made; try the command spherloc map."))
-            self._text.content = status_html(sentence[:1].upper() + sentence[1:], wrong=True)
+            self._text.content = status_html(begun(sentence), wrong=True)
 
     def _say(self, words: str) -> None:
         self._text.content = status_html(words)

@@ -16,7 +16,7 @@ from spherloc.mapping.photographs import MIN_IMAGES
 from spherloc_viz.app.panels.folders import Listing, Roots, Row, describe
 from spherloc_viz.app.panels.map_panel import OUTPUT, MapPanel
 from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_CALIBRATION_BYTES, File, Form, Scratch, open_upload
-from spherloc_viz.app.text import DIM, box, status_html
+from spherloc_viz.app.text import DIM, begun, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import limit_uploads, update_widget
 from spherloc_viz.app.workers import BackgroundWorker
@@ -314,5 +314,5 @@ class OpenPanel:
 
     def _complain(self, sentence: str) -> None:
         if sentence.partition(" ")[0].isalpha():  # file names stay as they are
-            sentence = sentence[:1].upper() + sentence[1:]
+            sentence = begun(sentence)
         self._status.content, self._status.visible = status_html(sentence, wrong=True), True

@@ -19,7 +19,7 @@ from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.review.reviewer import ReviewCard, Reviewer, Reviewing
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.review.run_list import RunList
-from spherloc_viz.app.text import WITHHELD, box, status_html
+from spherloc_viz.app.text import WITHHELD, begun, box, status_html
 from spherloc_viz.app.web.downloads import Downloads
 from spherloc_viz.app.web.touch import Touch, Touches, seen_views
 from spherloc_viz.app.workers import BackgroundWorker
@@ -98,7 +98,7 @@ class RecordingsPanel:
 
         def complain(sentence: str) -> None:
             self._complain(sentence)
-            card.say(_begun(sentence), wrong=True)
+            card.say(begun(sentence), wrong=True)
 
         reviewing = Reviewing(library, page.roots, card, page.enter, page.open_recorded, say, complain, self._follow)
         self._reviewer = Reviewer(touches, self._runs, reviewing, name)
@@ -216,12 +216,7 @@ class RecordingsPanel:
         self._status.content, self._status.visible = status_html(words), bool(words)
 
     def _complain(self, sentence: str) -> None:
-        self._status.content, self._status.visible = status_html(_begun(sentence), wrong=True), True
-
-
-def _begun(sentence: str) -> str:
-    """With a capital letter, unless it begins with the name of a file."""
-    return sentence[:1].upper() + sentence[1:] if sentence.partition(" ")[0].isalpha() else sentence
+        self._status.content, self._status.visible = status_html(begun(sentence), wrong=True), True
 
 
 def _switch_html(shown: str) -> str:

@@ -17,7 +17,7 @@ from spherloc.experiments.sweep_rows import rows_text, summarize, summary_text
 from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.panels.compare_panel import chips_html, ordered
 from spherloc_viz.app.plots.charts import charts_html, table_html
-from spherloc_viz.app.text import WITHHELD, status_html
+from spherloc_viz.app.text import WITHHELD, begun, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import put
 from spherloc_viz.options import usable_estimators
@@ -238,7 +238,7 @@ class SweepPanel:
         self._show_results()
 
     def _say(self, sentence: str, wrong: bool = False) -> None:
-        self._status.content = status_html(sentence[:1].upper() + sentence[1:], wrong)
+        self._status.content = status_html(begun(sentence), wrong)
 
     def _download(self, event: viser.GuiEvent) -> None:
         results = self._results

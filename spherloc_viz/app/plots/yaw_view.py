@@ -387,5 +387,5 @@ def caption(trace: Trace, story: YawStory, arcs: Arcs, bars: Bars) -> str:
         counts = ", ".join(f"{of:,} {name}" for of, name in zip(bars.total, KINDS, strict=True))
         rule = f"All {total:,} arcs in this window shown: {counts}."
     judged = right_ones(trace)[1]
-    colors = f"Green: both matches right {judged}; red: both wrong; pale red: one wrong."
+    colors = f"Green: both matches right {judged}; red: both wrong; faint red: one wrong."
     return " ".join(filter(None, (story.note, arcs.rule, rule, colors)))

@@ -10,7 +10,7 @@ from spherloc_viz import style
 from spherloc_viz.app.review.filters import pill
 from spherloc_viz.app.review.rows import OPENED, RULE, picture_html
 from spherloc_viz.app.review.run_library import RunLibrary
-from spherloc_viz.app.text import DIM, box, status_html
+from spherloc_viz.app.text import DIM, begun, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.app.workers import BackgroundWorker
@@ -89,7 +89,7 @@ class GalleryList:
         update_widget(self._html, content=html)
 
     def _fail(self, sentence: str) -> None:
-        self._html.content = status_html(sentence[:1].upper() + sentence[1:], wrong=True)
+        self._html.content = status_html(begun(sentence), wrong=True)
 
 
 def file_of(case: GalleryCase) -> str:

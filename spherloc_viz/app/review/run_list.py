@@ -13,7 +13,7 @@ from spherloc.errors import SpherlocError
 from spherloc_viz.app.review.filters import EXACT, OUTLIERS, Look, filters_html, pill
 from spherloc_viz.app.review.rows import rows_html
 from spherloc_viz.app.review.run_library import RunLibrary
-from spherloc_viz.app.text import DIM, box, status_html
+from spherloc_viz.app.text import DIM, begun, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import put, update_widget
 from spherloc_viz.app.workers import BackgroundWorker
@@ -196,7 +196,7 @@ class RunList:
         self._bar.visible = not self._hidden and bool(self._marked)
 
     def _fail(self, sentence: str) -> None:
-        self._problem.content = status_html(sentence[:1].upper() + sentence[1:], wrong=True)
+        self._problem.content = status_html(begun(sentence), wrong=True)
         self._problem.visible = not self._hidden
 
 
