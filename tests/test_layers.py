@@ -371,7 +371,7 @@ def test_thinning_is_stated_with_its_numbers(mc: Trace) -> None:
     assert len(translation.radii_m) > style.MAX_DRAWN_BALLS
     note = at(mc, "clique").step.note
     assert f"{style.MAX_DRAWN_BALLS} of {len(translation.radii_m)} balls" in note
-    assert f"{MAX_SURFACES} balls have a surface" in note
+    assert f"{MAX_SURFACES} have a surface" in note
 
 
 def test_yaw_chart_shows_overlap_truth_and_estimate(mc: Trace) -> None:
