@@ -23,6 +23,7 @@ from spherloc.trace import RansacStage, Trace, YawStage
 from spherloc_viz.app.plots.yaw_view import PEAK, WHOLE, YawView, yaw_svg
 from spherloc_viz.app.server import start_viser, stop_viser
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.yaw_story import (
     ALL,
     KINDS,
@@ -32,6 +33,7 @@ from spherloc_viz.layers.yaw_story import (
     Bars,
     Window,
     arcs_of,
+    at_step,
     bars_in,
     peak_window,
     sample,
@@ -297,6 +299,25 @@ def test_ransac_shows_its_hypotheses_and_a_press_goes_to_their_step(
     whole = view._html.content
     view.draw(run, "outcome", (), np.arange(120))
     assert view._html.content != whole, "the stem of the step at hand stands out"
+    assert view._html.content.count('opacity=".25"') == 0
+    assert whole.count('opacity=".25"') == first.count('opacity=".25"') > 0, "what was tried later is faint"
+
+
+def test_the_curve_is_that_of_the_step(server: viser.ViserServer, runs: dict[str, Trace]) -> None:
+    run = runs["mc"]
+    keys = [step.key for step in steps(run)]
+    view, _, _ = make(server)
+    contents = {}
+    for key in ("yaw-arcs-10", "yaw-arcs", "yaw-candidate-1"):
+        (chart,) = (chart for chart in paint(run, keys.index(key)).charts if chart.name == "yaw")
+        view.draw(run, key, (), np.arange(120), step_chart=chart)
+        contents[key] = view._html.content
+        story = at_step(yaw_story(run), chart)
+        assert story.top == chart.curves[0].y.max()
+        assert (story.candidate_deg is not None) == (key == "yaw-candidate-1") == ("candidate" in contents[key])
+    assert len(set(contents.values())) == 3
+    view.draw(run, "outcome", (), np.arange(120))
+    assert view._html.content == contents["yaw-arcs"], "without a step about yaws, all arcs count"
 
 
 def window_on(view: YawView) -> tuple[float, float]:

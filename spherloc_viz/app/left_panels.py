@@ -97,7 +97,9 @@ class LeftPanels:
         self.steps.show(picture.step, playing, tables, hidden)
         seen = self._seen
         if "Yaw" in seen:
-            self._yaw.draw(run.trace, picture.step.key, selected, kept, hidden)
+            of_yaw = picture.charts if picture.step.key.startswith("yaw-") else ()
+            chart = next((chart for chart in of_yaw if chart.name == "yaw"), None)
+            self._yaw.draw(run.trace, picture.step.key, selected, kept, hidden, chart)
         if "Graph" in seen:
             self._graph.draw(picture.graph, graph_begins(run.trace), selected, kept)
         if "Charts" in seen:

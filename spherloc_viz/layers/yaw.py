@@ -265,6 +265,8 @@ def _items(view: RunView, arcs: Arcs, shown: np.ndarray, numbers: tuple[int, int
     )
 
 
+CANDIDATE = "candidate"
+"""Label of a candidate yaw's marker in a chart."""
 SIZES = (10, 30, 100, 300, 1000, 3000)
 """Numbers of arcs that are shown in steps before all are."""
 MAX_CANDIDATES = 8
@@ -361,8 +363,8 @@ def _candidate(view: RunView, arcs: Arcs, places: IntArray) -> Frame:
     mean = float(np.sum(arcs.stage.hi_rad - arcs.stage.lo_rad)) / (2 * np.pi)
     items = _ring(view, arcs, drawn, counts, met, style.SAMPLE, (yaw,))
     return Frame(
-        f"The candidate yaw {lo:.2f}° lies in up to {here:,} of {len(arcs):,} arcs within a quarter of a degree, the "
-        f"most within 10° on either side. {_so_far(counts, places)}",
+        f"The candidate yaw {0.5 * (lo + hi):.1f}° lies in up to {here:,} of {len(arcs):,} arcs, counted over a quarter "
+        f"of a degree: the most within 10° on either side. {_so_far(counts, places)}",
         f"Σ 1(|f(θ)| ≤ τ) = {here:,}   (Eq. 34)",
         turned,
         view.colors(style.UNDECIDED),
@@ -378,7 +380,7 @@ def _so_far(counts: np.ndarray, places: IntArray) -> str:
         return "It is the first candidate from −180° on; only the highest peaks are shown."
     best = places[:-1][int(np.argmax(counts[places[:-1]]))]
     most, here = int(counts[best]), int(counts[places[-1]])
-    where = f"{ring.degrees_of(best, len(counts)):.2f}°"
+    where = f"{ring.degrees_of(best + 0.5, len(counts)):.1f}°"
     if here > most:
         return f"That beats the candidates before it, of which {where} was the best with {most:,}."
     return f"The candidate at {where} {'is in more' if most > here else 'is in as many'}: {most:,}."
@@ -445,5 +447,5 @@ def chart(view: RunView, stage: YawStage, found: bool = False, candidate_rad: fl
     plain = counts_chart(view, stage.overlap, stage.yaw_rad if found else None)
     if candidate_rad is None:
         return plain
-    candidate = ring.marker("candidate", candidate_rad, float(stage.overlap.max(initial=1)), style.SAMPLE)
+    candidate = ring.marker(CANDIDATE, candidate_rad, float(stage.overlap.max(initial=1)), style.SAMPLE)
     return Chart(plain.name, plain.title, plain.x_label, plain.y_label, (*plain.curves, candidate))

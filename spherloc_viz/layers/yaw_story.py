@@ -13,7 +13,8 @@ from spherloc.types import FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.frame import RunView
-from spherloc_viz.layers.primitives import Curve
+from spherloc_viz.layers.primitives import Chart, Curve
+from spherloc_viz.layers.yaw import CANDIDATE
 
 Window = tuple[float, float]
 """Yaws from the first, in [-180, 180) degrees, to the second, which exceeds 180 where the window crosses the seam."""
@@ -38,6 +39,8 @@ class YawStory:
     truth_deg: float | None
     note: str
     """What is left out, as a sentence; may be empty."""
+    candidate_deg: float | None = None
+    """The candidate yaw of a step."""
 
 
 def yaw_story(trace: Trace) -> YawStory:
@@ -67,7 +70,7 @@ def yaw_story(trace: Trace) -> YawStory:
         if len(poses) < len(exact.support):
             note = f"Of {len(exact.support):,} verified poses, the best {len(poses)} are shown as stems."
     elif ransac is not None:
-        title = "Yaw of each best hypothesis so far"
+        title = "Yaw of each hypothesis that was the best so far"
         counts = np.count_nonzero(ransac.inlier_masks, axis=1).tolist()
         rows = zip(ransac.cam_from_map, counts, ransac.improved_at.tolist(), strict=True)
         tried = tuple(
@@ -76,6 +79,14 @@ def yaw_story(trace: Trace) -> YawStory:
         )
     values = [float(curve.y.max(initial=0.0)) for curve in curves] + [float(count) for _, count, *_ in tried]
     return YawStory(title, y_label, curves, tried, max([1.0, *values]), estimate, truth, note)
+
+
+def at_step(story: YawStory, chart: Chart) -> YawStory:
+    """The story with the curves of a step's chart of the yaw: those of the arcs that the step shows."""
+    curves = tuple(curve for curve in chart.curves if curve.kind == "step")
+    yaws = [float(curve.x[0]) for curve in chart.curves if curve.label == CANDIDATE]
+    top = max([1.0, *(float(curve.y.max(initial=0.0)) for curve in curves)])
+    return replace(story, curves=curves, top=top, candidate_deg=yaws[0] if yaws else None)
 
 
 def _yaw_deg(trace: Trace, cam_from_map: FloatArray) -> float:

@@ -19,7 +19,8 @@ from spherloc_viz.app.plots.shapes import MINUS, Scale, round_ticks, tick_texts,
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import at_once, update_widget
-from spherloc_viz.layers.primitives import Curve
+from spherloc_viz.layers.primitives import Chart, Curve
+from spherloc_viz.layers.yaw import CANDIDATE
 from spherloc_viz.layers.yaw_story import (
     ALL,
     KINDS,
@@ -28,6 +29,7 @@ from spherloc_viz.layers.yaw_story import (
     Window,
     YawStory,
     arcs_of,
+    at_step,
     bars_in,
     peak_window,
     places_of,
@@ -92,6 +94,7 @@ def _legend(story: YawStory) -> list[str]:
     names = [(curve.label, curve.color, curve.kind == "level") for curve in story.curves]
     names += [("hypotheses", style.INLIER, False)] if story.hypotheses and not story.curves else []
     names += [("truth", style.TRUTH, False)] if story.truth_deg is not None else []
+    names += [(CANDIDATE, style.SAMPLE, False)] if story.candidate_deg is not None else []
     names += [("estimate", style.ESTIMATE, True)] if story.estimate_deg is not None else []
     parts, end = [], WIDTH_PX - RIGHT_PX
     for name, color, dashed in reversed(names):
@@ -162,10 +165,12 @@ def _beyond(curve: Curve, high: float) -> Curve:
 
 
 def _markers(story: YawStory, x: Scale, top: float, foot: float, window: Window) -> list[str]:
-    """The true yaw as a broad line and the estimate as a thin dashed one, so that both are seen where they coincide."""
+    """The true yaw as a broad line, a candidate as a narrower one and the estimate as a thin dashed one, so that all are
+    seen where they coincide."""
     parts = []
     known = (
         (story.truth_deg, style.TRUTH, 3.5, ""),
+        (story.candidate_deg, style.SAMPLE, 2.5, ""),
         (story.estimate_deg, style.ESTIMATE, 1.75, ' stroke-dasharray="5 4"'),
     )
     for yaw, color, width, dashes in known:
@@ -176,9 +181,13 @@ def _markers(story: YawStory, x: Scale, top: float, foot: float, window: Window)
 
 
 def _hypotheses(story: YawStory, x: Scale, y: Scale, window: Window, now: str) -> list[str]:
-    """A line for the yaw of each pose that was tried, as high as its support; that of the current step is filled."""
-    parts = []
-    for yaw, count, name, key in story.hypotheses:
+    """A line for the yaw of each pose that was tried, as high as its support; that of the current step has its own
+    colour, and those that were tried later are faint."""
+    parts: list[str] = []
+    steps = [key for *_, key in story.hypotheses]
+    current = steps.index(now) if now and now in steps else len(steps)
+    for number, (yaw, count, name, key) in enumerate(story.hypotheses):
+        faint = ' opacity=".25"' if number > current else ""
         for place in places_of(yaw, window):
             left, top = x.at(place), y.at(count)
             color = style.SAMPLE if key and key == now else style.INLIER
@@ -186,7 +195,7 @@ def _hypotheses(story: YawStory, x: Scale, y: Scale, window: Window, now: str) -
             tip = shapes.tooltip(f"{name}: {count} inliers at {degrees(yaw)}")
             stem = f"M{left:.1f} {y.low_px:.1f}V{top:.1f}"
             parts.append(
-                f'<g{press}>{tip}<path d="{stem}" {shapes.stroke(color, 1.5)}/>'
+                f'<g{press}{faint}>{tip}<path d="{stem}" {shapes.stroke(color, 1.5)}/>'
                 + shapes.dot(left, top, 3.0, shapes.fill(color))
                 + "</g>"
             )
@@ -292,18 +301,21 @@ class YawView:
         selected: tuple[int, ...],
         kept: NDArray[np.int64],
         hidden: bool = False,
+        step_chart: Chart | None = None,
     ) -> None:
         """Show a run, at a step, with the pairs of the ``selected`` matches (indices in the problem) highlighted.
 
-        ``kept`` (N,) are the numbers of the matches on the page. ``hidden`` leaves out the results.
-        Sends nothing if nothing changed.
+        ``kept`` (N,) are the numbers of the matches on the page. ``hidden`` leaves out the results. ``step_chart`` is
+        the chart of the yaw as of a step about yaws, whose curve then takes the place of the run's. Sends nothing if nothing changed.
         """
         with self._lock:
             wanted = self._wanted
         story = untold(self._story(trace)) if hidden else self._story(trace)
+        if step_chart is not None:
+            story = at_step(story, step_chart)
         hypothesis = step_key.removesuffix("-pose")
         shown_key = hypothesis if any(hypothesis == key for *_, key in story.hypotheses) else ""
-        drawn = (trace, shown_key, selected, wanted, hidden)
+        drawn = (trace, shown_key, selected, wanted, hidden, step_chart)
         if self._drawn is not None and self._drawn[1:] == drawn[1:] and self._drawn[0] is trace:
             return
         arcs = NO_ARCS if hidden else self._arcs_of(trace, selected)
