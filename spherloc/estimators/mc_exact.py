@@ -9,6 +9,8 @@ uncertain, robust fits to its hypotheses.
 """
 
 from dataclasses import dataclass
+from itertools import combinations
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +29,10 @@ from spherloc.geometry import level_poses, pose, yaw_of, yaw_rotation
 from spherloc.last_step import conclude
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, matches_of, residuals_px
+from spherloc.solvers.p3p import p3p
 from spherloc.solvers.two_point import two_point
 from spherloc.trace import Certificate, ConsensusStage, PositionStage, Stage
-from spherloc.types import FloatArray
+from spherloc.types import FloatArray, IntArray
 from spherloc.watch import working_s
 
 MAX_CORRESPONDENCES = 200_000
@@ -50,6 +53,9 @@ choice."""
 MAX_PAIR_STARTS, PAIR_STARTS_EFFORT = 100, 5000
 """Pairs whose 2P poses are tried where the search takes long and gravity is uncertain: the most, and the most matches
 that all of them are fitted to."""
+MAX_TRIPLES, MAX_TILT_IN_BOUNDS = 1000, 2.0
+"""Triples whose P3P poses are tried there too, at most, and the largest tilt of such a pose, in gravity bounds: with
+noise in three matches it may be beyond the bound although that of the best pose is not."""
 YAW_BINS = 1440
 MAX_LEVELS, MAX_BOXES = 12, 200
 """Of the boxes that are kept for the picture."""
@@ -295,27 +301,40 @@ def first_pose(
 def _another(
     aligned: AlignedProblem, bounds: Bounds, matches: PackedMatches, guess: TwoPointSearch
 ) -> tuple[FloatArray, int] | None:
-    """Where gravity is uncertain, the best of the robust fits to 2P poses of all pairs or, if these are many, of pairs
-    that the guess explains: a pose (3, 4) within the gravity bound, and what it explains."""
+    """Where gravity is uncertain, the best of the robust fits to 2P poses of pairs and to P3P poses of triples: a pose
+    (3, 4) within the gravity bound, and what it explains. All pairs and triples are tried or, if these are many, some
+    of the matches that the guess explains."""
     size = len(aligned.points)
     most = min(MAX_PAIR_STARTS, PAIR_STARTS_EFFORT // size)
     if aligned.gravity_bound_rad == 0.0 or not guess.found or most == 0:
         return None
-    if size * (size - 1) // 2 <= most:
-        pairs = np.column_stack(np.triu_indices(size, 1))
-    else:
-        ((yaw, translation),) = _poses(guess)
-        members = np.flatnonzero(residuals_px(aligned, pose(yaw_rotation(yaw), translation)) <= bounds.pixels)
-        pairs = np.random.default_rng(0).choice(members, (most, 2))
-        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    ((yaw, translation),) = _poses(guess)
+    explained = np.flatnonzero(residuals_px(aligned, pose(yaw_rotation(yaw), translation)) <= bounds.pixels)
+    pairs = _samples(size, 2, explained, most)
     yaws, translations, exists = two_point(aligned.bearings[pairs], aligned.points[pairs])
+    triples = _samples(size, 3, explained, MAX_TRIPLES)
+    tilted, _ = p3p(aligned.bearings[triples], aligned.points[triples])
+    tilts = np.arccos(np.clip(tilted[:, 1, 1], -1.0, 1.0))
+    upright = np.argsort(tilts, kind="stable")[:most]
+    tilted = tilted[upright[tilts[upright] <= MAX_TILT_IN_BOUNDS * aligned.gravity_bound_rad]]
     best = None
-    for level in level_poses(yaws[exists], translations[exists]):
-        for tilted in _narrowed(aligned, bounds, matches, level):
-            count = supported(aligned, tilted, bounds.noise_px)
+    for start in (*level_poses(yaws[exists], translations[exists]), *tilted):
+        within = within_gravity(matches, start, aligned.gravity_bound_rad)
+        for found in (within, *_narrowed(aligned, bounds, matches, start)):
+            count = supported(aligned, found, bounds.noise_px)
             if best is None or count > best[1]:
-                best = tilted, count
+                best = found, count
     return best
+
+
+def _samples(size: int, each: int, explained: IntArray, most: int) -> IntArray:
+    """All samples (S, ``each``) of that many of ``size`` matches or, if they are more than ``most``, up to as many of
+    the ``explained`` ones (K,) at random."""
+    if comb(size, each) <= most:
+        return np.array(list(combinations(range(size), each)), dtype=np.int64).reshape(-1, each)
+    drawn = np.random.default_rng(0).choice(explained, (most, each))
+    ordered = np.sort(drawn, axis=1)
+    return drawn[(np.diff(ordered, axis=1) > 0).all(axis=1)]
 
 
 def within_gravity(matches: PackedMatches, cam_from_map: FloatArray, gravity_bound_rad: float) -> FloatArray:

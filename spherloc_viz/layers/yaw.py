@@ -363,8 +363,8 @@ def _candidate(view: RunView, arcs: Arcs, places: IntArray) -> Frame:
     mean = float(np.sum(arcs.stage.hi_rad - arcs.stage.lo_rad)) / (2 * np.pi)
     items = _ring(view, arcs, drawn, counts, met, style.SAMPLE, (yaw,))
     return Frame(
-        f"The candidate yaw {0.5 * (lo + hi):.1f}° lies in up to {here:,} of {len(arcs):,} arcs, counted over a quarter "
-        f"of a degree: the most within 10° on either side. {_so_far(counts, places)}",
+        f"The candidate yaw {0.5 * (lo + hi):.1f}° lies in up to {here:,} of {len(arcs):,} arcs, counted over a "
+        f"quarter of a degree: the most within 10° on either side. {_so_far(counts, places)}",
         f"Σ 1(|f(θ)| ≤ τ) = {here:,}   (Eq. 34)",
         turned,
         view.colors(style.UNDECIDED),

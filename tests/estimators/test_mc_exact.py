@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_alignment_invariance import turned
 
+from benchmarks.certificate import random_problem
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
@@ -140,6 +141,13 @@ def test_limits_are_honest(scene_of, limit):
             stopped += 1
             assert not short.certificate.proven
     assert stopped >= 4
+
+
+@pytest.mark.parametrize(("seed", "most"), [(338, 10), (403, 3), (884, 7)])
+def test_poses_of_triples_find_what_those_of_pairs_do_not(seed, most):
+    """Brute force explains so many; from the 2P poses of all pairs the search ended with fewer."""
+    problem, bound_px, _ = random_problem(seed)
+    assert solve(problem, Options(bound_px=bound_px)).certificate.lower_bound >= most
 
 
 def test_more_effort_never_proves_less(scene_of):

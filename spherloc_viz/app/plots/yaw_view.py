@@ -165,8 +165,8 @@ def _beyond(curve: Curve, high: float) -> Curve:
 
 
 def _markers(story: YawStory, x: Scale, top: float, foot: float, window: Window) -> list[str]:
-    """The true yaw as a broad line, a candidate as a narrower one and the estimate as a thin dashed one, so that all are
-    seen where they coincide."""
+    """The true yaw as a broad line, a candidate as a narrower one and the estimate as a thin dashed one, so that all
+    are seen where they coincide."""
     parts = []
     known = (
         (story.truth_deg, style.TRUTH, 3.5, ""),
@@ -306,7 +306,8 @@ class YawView:
         """Show a run, at a step, with the pairs of the ``selected`` matches (indices in the problem) highlighted.
 
         ``kept`` (N,) are the numbers of the matches on the page. ``hidden`` leaves out the results. ``step_chart`` is
-        the chart of the yaw as of a step about yaws, whose curve then takes the place of the run's. Sends nothing if nothing changed.
+        the chart of the yaw as of a step about yaws, whose curve then takes the place of the run's. Sends nothing if
+        nothing changed.
         """
         with self._lock:
             wanted = self._wanted
