@@ -41,7 +41,7 @@ def check(path: Path) -> str:
     try:
         with path.open("rb") as opened:
             if not zipfile.is_zipfile(opened):
-                raise ValueError("it is no NPZ file")
+                raise Refused(f"{path}: not a proof, which is an NPZ file.")
         with np.load(path, allow_pickle=False) as file:
             proof: Arrays = {name: file[name] for name in file.files}
         return _check(proof)
