@@ -80,7 +80,7 @@ def plans(view: RunView) -> list[Plan]:
 def _no_pose(view: RunView) -> Frame:
     message, _, remark = view.trace.message.partition(". ")
     return Frame(
-        f"{message.rstrip('.')}. Give more matches, a wider bound or better gravity.",
+        f"{message.rstrip('.')}. Give more matches, another bound or better gravity.",
         "",
         view.standing(np.eye(3)),
         view.colors(style.OUTLIER),

@@ -70,7 +70,7 @@ def yaw_story(trace: Trace) -> YawStory:
         if len(poses) < len(exact.support):
             note = f"Of {len(exact.support):,} verified poses, the best {len(poses)} are shown as stems."
     elif ransac is not None:
-        title = "Yaw of each hypothesis that was the best so far"
+        title = "Yaw of each best hypothesis"
         counts = np.count_nonzero(ransac.inlier_masks, axis=1).tolist()
         rows = zip(ransac.cam_from_map, counts, ransac.improved_at.tolist(), strict=True)
         tried = tuple(

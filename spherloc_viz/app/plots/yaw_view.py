@@ -91,7 +91,9 @@ def zoom(window: Window) -> str:
 
 def _legend(story: YawStory) -> list[str]:
     """Samples of the lines, from the right."""
-    names = [(curve.label, curve.color, curve.kind == "level") for curve in story.curves]
+    # With a candidate there is no room for the curve's name; the axis has it too.
+    curves = story.curves if story.candidate_deg is None else ()
+    names = [(curve.label, curve.color, curve.kind == "level") for curve in curves]
     names += [("hypotheses", style.INLIER, False)] if story.hypotheses and not story.curves else []
     names += [("truth", style.TRUTH, False)] if story.truth_deg is not None else []
     names += [(CANDIDATE, style.SAMPLE, False)] if story.candidate_deg is not None else []
