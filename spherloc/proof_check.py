@@ -39,14 +39,12 @@ class Refused(Exception):  # noqa: N818
 def check(path: Path) -> str:
     """The proven statement as a sentence; raises ``Refused`` if the proof does not hold."""
     try:
-        with path.open("rb") as opened:
-            if not zipfile.is_zipfile(opened):
-                raise Refused(f"{path}: not a proof, which is an NPZ file.")
         with np.load(path, allow_pickle=False) as file:
             proof: Arrays = {name: file[name] for name in file.files}
         return _check(proof)
     except UNREADABLE as error:
-        raise Refused(f"{path}: not a proof that can be read ({error}).") from None
+        reason = error if isinstance(error, OSError) or zipfile.is_zipfile(path) else "it is no NPZ file"
+        raise Refused(f"{path}: not a proof that can be read ({reason}).") from None
 
 
 def _check(proof: Arrays) -> str:

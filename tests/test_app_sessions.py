@@ -99,6 +99,7 @@ class House:
         session = self.sessions._open[number]
         session._display.panels.steps.go("outcome")
         until(lambda: session._display.panels.steps._choice.value.endswith("Outcome"))
+        until(lambda: session._display.panels._of_step == "Residuals")  # drawn after the steps
         return self.pages[-1], session
 
     def close(self) -> None:
