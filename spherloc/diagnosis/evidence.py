@@ -180,8 +180,8 @@ def free_fit(aligned: AlignedProblem, starts: list[FloatArray], bound_px: float)
     return max(fits, key=lambda fit: fit.support(wide), default=None)
 
 
-NARROWER = 4.0
-"""Ratio of one bound to the next lower one that is tried ..."""
+NARROWER, MAX_NARROWER = 4.0, 6
+"""Ratio of one bound to the next lower one that is tried, and the largest number of those ..."""
 NOISE_SDS = 3.0
 """... down to this many standard deviations of the noise: a lower one would take right matches out."""
 
@@ -201,13 +201,13 @@ def narrow_fit(trace: Trace) -> Narrow | None:
     """Of poses found within lower noise bounds than the run's, the one that chance explains least; None if the run's
     bound is not clearly above the noise."""
     aligned, options = trace.problem.aligned, trace.options
-    bound_px, found = float(options.bound_px) / NARROWER, []
-    while bound_px >= NOISE_SDS * options.noise_px:
+    lower_px = float(options.bound_px) / NARROWER ** np.arange(1, MAX_NARROWER + 1)
+    found = []
+    for bound_px in lower_px[lower_px >= NOISE_SDS * options.noise_px].tolist():
         if (cam_from_map := search(aligned, bound_px, options)) is not None:
             fit = fit_of(aligned, cam_from_map)
             rate = chance_rate(aligned.bearings, bounds_of(aligned, bound_px).radians)
             found.append(Narrow(bound_px, fit, nfa(len(aligned.points), fit.support(bound_px), rate)))
-        bound_px /= NARROWER
     return min(found, key=lambda narrow: narrow.nfa, default=None)
 
 

@@ -77,7 +77,7 @@ class LinkedRuns:
         scene = SceneRequest(next(iter(self.catalog.scenes)), 0)
         begin = RunRequest(scene, ESTIMATOR, default_options(ESTIMATOR, self.catalog.problem(scene)))
         followed = self._follower.follow(link, begin, PageView("", (), "dark"))
-        if followed.remarks:
+        if followed.remarks or followed.request is None:
             raise InputError(" ".join(followed.remarks))
         request = followed.request
         if self._last is None or self._last.request != request:

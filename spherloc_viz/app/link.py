@@ -118,7 +118,8 @@ def address_html(link: str, session: str, followed: int, numbers: Mapping[str, s
 class Followed:
     """What a link asks for, and what of it could not be opened."""
 
-    request: RunRequest
+    request: RunRequest | None
+    """None for that of the page itself."""
     view: PageView
     remarks: tuple[str, ...]
     """One sentence for each part of the link that could not be opened."""
@@ -160,7 +161,7 @@ class Follower:
         opened = self._recorded(said, remarks)
         request = self._request(said, now, remarks) if opened is None else opened.request
         if request is None:
-            return Followed(now, view, tuple(remarks))
+            return Followed(None, view, tuple(remarks))
         return Followed(request, _view(said, view, opened, remarks), tuple(remarks), opened, said.get("step"))
 
     def _recorded(self, said: dict[str, Any], remarks: list[str]) -> Opened | None:

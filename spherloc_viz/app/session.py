@@ -282,7 +282,8 @@ class Session:
         arrived = True
         try:
             followed = self._follower.follow(link, self._shown_request(), self._view())
-            self._asked.append((number, followed.request))
+            if followed.request is not None:
+                self._asked.append((number, followed.request))
             pause = self._solve_request()
             self._arrive(followed, number)
             return pause
@@ -304,11 +305,12 @@ class Session:
 
     def _arrive(self, followed: Followed, number: int) -> None:
         """A link was followed: set step, selection and viewer. ``number`` is that of the change before it."""
-        with self._changes.as_of(number):
-            self._controls.display.theme = followed.view.theme
-            self._controls.display.answers_hidden = followed.view.answers_hidden
         remarks = list(followed.remarks)
-        if self._run is not None:
+        if followed.request is not None:
+            with self._changes.as_of(number):
+                self._controls.display.theme = followed.view.theme
+                self._controls.display.answers_hidden = followed.view.answers_hidden
+        if followed.request is not None and self._run is not None:
             kept = set(self._run.kept.tolist())
             self._edits.select(set(followed.view.selected) & kept)
             key = _step_key(self._run.trace, followed)
