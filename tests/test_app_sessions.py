@@ -377,6 +377,20 @@ def test_a_tab_is_chosen_only_by_whoever_has_seen_the_step(house: House) -> None
     assert see("Residuals;Residuals;Matches 1") == "step's"
 
 
+def test_what_a_link_was_refused_for_stays_until_another_run(house: House) -> None:
+    """A page answers values that the server sets as if its user had set them."""
+    _, session = house.visit()
+    session._touches.deliver(Touch("link", "v=1&scene=nowhere", 0.0, 0.0, 0.0, 0.0, False))
+    until(lambda: session._status._complaint is not None)
+    number, session._answers = session._answers, -1
+    session.changed()
+    until(lambda: session._answers == number)
+    session._solver.ask()
+    assert session._status._complaint is not None and "'nowhere' is not open" in session._status._complaint[0]
+    session.use_estimator("ransac-2p")
+    until(lambda: session._status._complaint is None)
+
+
 def test_a_link_counts_as_followed_when_its_step_is_drawn(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
     _, session = house.visit()
     gate, draw = threading.Event(), session._display.draw

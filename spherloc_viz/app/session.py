@@ -320,7 +320,7 @@ class Session:
             if followed.view.viewpoint:
                 self._display.canvas.hold(key, followed.view.viewpoint)
         if remarks:
-            self.complain(" ".join(begun(remark) for remark in remarks))
+            self._status.complain(" ".join(begun(remark) for remark in remarks), lasting=True)
 
     def _view(self) -> PageView:
         """Step, selection, viewer, hidden answers and tab of the page, for its link."""
@@ -342,6 +342,7 @@ class Session:
         self._controls.slow.renew()
         request = self._request(self._newest_opened(gesture))
         self._history.note(request, time.monotonic(), gesture)
+        before = self._run
         if self._run is None or request != self._run.request:
             problem = self._problem(request.scene)
             watch = self._controls.slow.begin()
@@ -351,14 +352,14 @@ class Session:
             finally:
                 self._controls.slow.end()
             run = Run(request, trace, _kept(request, problem))
-            self._run = run
+            self._run, self._answers = run, number
+            self._page.ask()
             self._pictures.want(run)
-        elif self._answers == number:  # nothing has changed: what a link was refused for stays on the page
-            return QUIET_S
-        self._answers = number
-        self._page.ask()
+        elif self._answers != number:
+            self._answers = number
+            self._page.ask()
         self._status.say(self._runs.announce(self._run))
-        self._status.withdraw()
+        self._status.withdraw(another=self._run is not before)
         return QUIET_S
 
     def _newest_opened(self, gesture: int) -> tuple[int, RunRequest] | None:

@@ -21,6 +21,7 @@ class Status:
         self._client = client
         self._line = client.gui.add_html(_line_html("Solving the first problem …"))
         self._complaint: tuple[str, viser.NotificationHandle] | None = None
+        self._lasting = False
         self._lock = threading.Lock()
 
     def say(self, sentence: str, keep: str = "") -> None:
@@ -28,10 +29,12 @@ class Status:
         html = _line_html(sentence, keep=keep)
         update_widget(self._line, content=html)
 
-    def complain(self, sentence: str) -> None:
-        """Show one sentence about what went wrong; the page keeps its last run and stays usable."""
+    def complain(self, sentence: str, lasting: bool = False) -> None:
+        """Show one sentence about what went wrong; the page keeps its last run and stays usable. A ``lasting`` one is
+        about something else than the settings of the page, so that it stays though these are right."""
         sentence = begun(sentence)
         with self._lock:
+            self._lasting = lasting
             self._line.content = _line_html(sentence, wrong=True)
             if self._complaint is not None:
                 if self._complaint[0] == sentence:
@@ -48,10 +51,11 @@ class Status:
         log.error("client %s", self._client.client_id, exc_info=error)
         self.complain(f"This is a bug in the playground ({error!r}); change a setting or reload the page.")
 
-    def withdraw(self) -> None:
-        """The error that is shown is over: take its sentence away."""
+    def withdraw(self, another: bool) -> None:
+        """The page's settings are right: take away the sentence about an error, a lasting one only if ``another`` run
+        has come."""
         with self._lock:
-            if self._complaint is not None:
+            if self._complaint is not None and (another or not self._lasting):
                 self._complaint[1].remove()
                 self._complaint = None
 

@@ -106,10 +106,10 @@ def test_a_link_to_a_scene_that_is_not_there_opens_the_page_s_own(
     browser: Browser, images_address: tuple[str, Path]
 ) -> None:
     """Before there is a run, no query is chosen yet."""
-    tab = Playground(browser, f"{images_address[0]}/#v=1&scene=nowhere")
+    tab = Playground(browser, f"{images_address[0]}/#v=1&scene=nowhere", new=True)
     expect(tab.page.get_by_text("The scene 'nowhere' is not open here").first).to_be_visible()
     expect(tab.page).to_have_url(re.compile("scene=small.apartment"))
-    tab.close()
+    tab.page.context.close()
 
 
 def test_queries_their_photographs_and_the_whole_sequence(
