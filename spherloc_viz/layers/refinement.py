@@ -128,10 +128,10 @@ def _outliers(view: RunView, stage: RefinementStage) -> Frame:
     if not len(errors):
         told = "All matches are within the bound. None is rejected"
     elif not len(seen):
-        told = f"All {len(errors)} others are more than 90° from their bearings. No bound would make them agree"
+        told = f"Rejected: {len(errors):,}, all more than 90° from their bearings. No bound would accept one of them"
     else:
         told = (
-            f"{len(errors)} matches disagree, {far} of them by more than 90°. "
+            f"Rejected: {len(errors):,}, of them {far} by more than 90°. "
             f"The median of the others is off by {np.median(seen):.0f} px and the nearest by {seen.min():.2f} px"
         )
     return Frame(

@@ -307,7 +307,7 @@ def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
     for size in growing(len(balls), *SIZES):
         title, draw, words = f"{size} balls and their graph", partial(_some, view, balls, size), f"{size} nodes."
         out.append(Plan(f"balls-{size}", title, draw, graph=partial(graph, balls.order[:size], no_balls, words)))
-    words = f"All {len(balls):,} nodes."
+    words = f"All {len(balls):,} nodes." if len(balls) > 1 else "The only node."
     out.append(
         Plan(
             "balls", "Balls of camera positions", lambda: _all(view, balls), graph=partial(graph, None, no_balls, words)

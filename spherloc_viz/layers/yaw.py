@@ -369,7 +369,7 @@ def _candidate(view: RunView, arcs: Arcs, places: IntArray) -> Frame:
         turned,
         view.colors(style.UNDECIDED),
         view.no_matches(),
-        note=f"A yaw at random lies in {mean:,.0f} arcs on average. {len(drawn)} arcs are drawn; pink ones hold it.",
+        note=f"A yaw at random lies in {mean:,.0f} arcs on average. Arcs drawn: {len(drawn)}; pink ones hold it.",
         items=(*items, ring.spoke("ring/candidate", view, view.middle, yaw, style.SAMPLE)),
     )
 

@@ -23,7 +23,7 @@ from spherloc_viz.recording.content.writer import write_recording
 
 PATIENCE_S = 60.0
 """A page that draws in software takes some ten seconds for a picture of its canvas."""
-WHERE = "Paths in the code are relative to the folder in which the playground was started; run it there."
+WHERE = "Paths without a slash in front begin at the folder in which the playground was started; run the code there."
 LINK = box(
     '<button class="copy-link" data-copy="" title="The page\'s address, to be pasted into a message">'
     f'Copy the link to what you see</button><div style="{DIM}">'

@@ -400,7 +400,8 @@ def caption(trace: Trace, story: YawStory, arcs: Arcs, bars: Bars) -> str:
         rule = f"{shown:,} of {total:,} arcs in this window shown, an even sample: {counts}."
     else:
         counts = ", ".join(f"{of:,} {name}" for of, name in zip(bars.total, KINDS, strict=True))
-        rule = f"All {total:,} arcs in this window shown: {counts}."
+        rule = f"All {total:,} arcs" if total > 1 else "The only arc"
+        rule = f"{rule} in this window shown: {counts}."
     judged = right_ones(trace)[1]
     colors = f"Green: both matches right {judged}; red: both wrong; faint red: one wrong."
     return " ".join(filter(None, (story.note, arcs.rule, rule, colors)))
