@@ -74,6 +74,16 @@ def pytest_terminal_summary(terminalreporter: "pytest.TerminalReporter") -> None
 
 
 @pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """What is imported and collected stays, so the garbage collector does not look through it: it takes half the time."""
+    gc.disable()
+    result = yield
+    gc.enable()
+    gc.freeze()
+    return result
+
+
+@pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, object, object]:
     """What a file leaves open is found at its end and listed under its name, not raised in another file's test."""
     result = yield
@@ -81,6 +91,7 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
         # Until pytest puts its own filters back, which it does after this test.
         warnings.simplefilter("always", ResourceWarning)
         gc.collect()
+        gc.freeze()
     return result
 
 
