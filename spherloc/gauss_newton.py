@@ -35,7 +35,7 @@ MIN_DAMPING, MAX_DAMPING = 1e-3, 1e4
 """Damping of the normal equations, relative to their diagonal: what a failed step starts with and what ends the fit."""
 
 
-class Matches(NamedTuple):
+class AlignedMatches(NamedTuple):
     """M matches as the kernels take them, in gravity-aligned frames."""
 
     bearings: FloatArray

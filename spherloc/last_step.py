@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from spherloc.bounds import Bounds
-from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD, ROBUST_NONE, Matches, Noise, polish_path
+from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD, ROBUST_NONE, AlignedMatches, Noise, polish_path
 from spherloc.narrowing import MAX_DESCENTS, NARROWINGS, descend, narrow, search_nearby, truncated_squares
 from spherloc.problem import AlignedProblem
 from spherloc.refine import (
@@ -104,7 +104,9 @@ def _promising(aligned: AlignedProblem, starts: Sequence[FloatArray], bounds: Bo
     return [start for k, (start, count) in enumerate(zip(starts, counts, strict=False)) if k == 0 or count >= enough]
 
 
-def _narrowed(matches: Matches, wide: FloatArray, limits: FloatArray, start: FloatArray, noise: Noise) -> FloatArray:
+def _narrowed(
+    matches: AlignedMatches, wide: FloatArray, limits: FloatArray, start: FloatArray, noise: Noise
+) -> FloatArray:
     """The start and the poses (I, 3, 4) at bounds that narrow from ``wide`` (M,) to ``limits`` (M,), px."""
     path = np.empty((1 + len(NARROWINGS), 3, 4))
     path[0] = start
@@ -112,7 +114,7 @@ def _narrowed(matches: Matches, wide: FloatArray, limits: FloatArray, start: Flo
     return path
 
 
-def _descended(matches: Matches, limits: FloatArray, path: FloatArray, noise: Noise) -> tuple[FloatArray, float]:
+def _descended(matches: AlignedMatches, limits: FloatArray, path: FloatArray, noise: Noise) -> tuple[FloatArray, float]:
     """The path (I, 3, 4), continued to a minimum of the sum of truncated squares, and that sum at its end."""
     more, last = np.empty((MAX_DESCENTS, 3, 4)), path[-1].copy()
     states, cost = descend(matches, limits, last, noise, more)

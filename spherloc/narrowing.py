@@ -11,8 +11,8 @@ import numpy as np
 from spherloc.gauss_newton import (
     MIN_GRAVITY_SD_RAD,
     ROBUST_NONE,
+    AlignedMatches,
     CostModel,
-    Matches,
     degrees_of_freedom,
     empty_equations,
     middle_of,
@@ -73,7 +73,7 @@ MIN_FOR_NOISE = 8
 def errors_of(matches, cam_from_map, errors):
     """Write the reprojection ``errors`` (M,) at a pose, px to first order; inf for points behind their bearing.
 
-    The pose is ``cam_from_map`` (3, 4). ``matches`` are ``gauss_newton.Matches``, as in all functions here.
+    The pose is ``cam_from_map`` (3, 4). ``matches`` are ``gauss_newton.AlignedMatches``, as in all functions here.
     """
     bearings, points, jacobian, p = matches.bearings, matches.points, matches.pixel_jacobian, cam_from_map
     for k in range(len(points)):
@@ -134,7 +134,7 @@ def robust_steps(matches, limits_px, cam_from_map, noise, most_steps):
                 for a in range(2):
                     for b in range(3):
                         scaled_jacobian[k, a, b] = share * jacobian[k, a, b]
-        if not _step(Matches(bearings, points, scaled_jacobian), near, cam_from_map, noise, DAMPING) > MIN_STEP:
+        if not _step(AlignedMatches(bearings, points, scaled_jacobian), near, cam_from_map, noise, DAMPING) > MIN_STEP:
             break
 
 
@@ -242,7 +242,7 @@ def search_nearby(matches, wide_px, limits_px, start, noise, best, least):
     random_state, drawn, improved = np.uint64(0x9E3779B97F4A7C15), 0, 0
     needed = _samples_needed(matches, limits_px, best, around, errors)
     sample, chosen, state = np.empty(SAMPLE_SIZE, np.int64), np.empty(SAMPLE_SIZE, np.bool_), np.empty((3, 4))
-    few = Matches(np.empty((SAMPLE_SIZE, 3)), np.empty((SAMPLE_SIZE, 3)), np.empty((SAMPLE_SIZE, 2, 3)))
+    few = AlignedMatches(np.empty((SAMPLE_SIZE, 3)), np.empty((SAMPLE_SIZE, 3)), np.empty((SAMPLE_SIZE, 2, 3)))
     fill_vector(chosen, True)
     while drawn < MAX_SAMPLES and (drawn < needed or drawn < improved + MIN_SAMPLES):
         for k in range(SAMPLE_SIZE):
@@ -341,7 +341,7 @@ def fit_to_noise(matches, limits_px, cam_from_map, noise, path):
                 for a in range(2):
                     for b in range(3):
                         scaled_jacobian[k, a, b] = scale * jacobian[k, a, b]
-        length = _step(Matches(bearings, points, scaled_jacobian), near, cam_from_map, noise, DAMPING)
+        length = _step(AlignedMatches(bearings, points, scaled_jacobian), near, cam_from_map, noise, DAMPING)
         copy_matrix(cam_from_map, path[done])
         if not length > ADAPTIVE_LEAST_STEP:
             return done + 1

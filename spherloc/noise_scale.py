@@ -9,7 +9,7 @@ which is steadier than the matrix where there are few matches).
 
 import numpy as np
 
-from spherloc.gauss_newton import Matches
+from spherloc.gauss_newton import AlignedMatches
 from spherloc.kernel_cache import kernel
 from spherloc.types import BoolArray, FloatArray, IntArray
 
@@ -21,7 +21,9 @@ _GENERIC_DIRECTION = np.array([0.7390851332151607, 0.5671432904097838, 0.9159655
 """A direction in which no two different points have the same coordinate, for practical purposes."""
 
 
-def variance_factor(matches: Matches, cam_from_map: FloatArray, inliers: BoolArray, noise_px: float, dof: int) -> float:
+def variance_factor(
+    matches: AlignedMatches, cam_from_map: FloatArray, inliers: BoolArray, noise_px: float, dof: int
+) -> float:
     """The factor for the covariance of an aligned pose (3, 4) that assumes a noise of ``noise_px``.
 
     ``inliers`` (M,) are the fitted matches, ``dof`` the degrees of freedom of the pose. 1 if there are too few inliers.

@@ -17,8 +17,8 @@ from spherloc.gauss_newton import (
     ROBUST_CAUCHY,
     ROBUST_HUBER,
     ROBUST_NONE,
+    AlignedMatches,
     CostModel,
-    Matches,
     Noise,
     degrees_of_freedom,
     empty_equations,
@@ -98,13 +98,13 @@ def gravity_sd_rad(aligned: AlignedProblem, options: RefinementOptions) -> float
     return aligned.gravity_sd_rad if options.gravity_sd_deg is None else float(np.radians(options.gravity_sd_deg))
 
 
-def matches_of(aligned: AlignedProblem) -> Matches:
+def matches_of(aligned: AlignedProblem) -> AlignedMatches:
     """The matches as kernels take them.
 
     All are copies: kernels also call each other with arrays of their own, which may be written to, and a read-only
     array would be another type, for which all of them are compiled once more.
     """
-    return Matches(aligned.bearings.copy(), aligned.points.copy(), aligned.pixel_from_bearing.copy())
+    return AlignedMatches(aligned.bearings.copy(), aligned.points.copy(), aligned.pixel_from_bearing.copy())
 
 
 def noise_of(aligned: AlignedProblem, options: RefinementOptions) -> Noise:
@@ -302,7 +302,7 @@ def rescue(matches, limits_px, explained, path, states, noise):
     members = mark_within(errors, limits_px, fitted)
     cost = sum_of_squares(errors, fitted)
     variance = max(noise.sd_px * noise.sd_px, cost / max(2 * members, 1))
-    scaled, steps = Matches(matches.bearings, matches.points, matches.pixel_jacobian.copy()), 0
+    scaled, steps = AlignedMatches(matches.bearings, matches.points, matches.pixel_jacobian.copy()), 0
     rotation, translation = rotation_of(path[states - 1]), translation_of(path[states - 1])
     robust, most_steps = np.int64(ROBUST_NONE), np.int64(MAX_STEPS)
     for _ in range(MAX_RESCUES):

@@ -23,7 +23,7 @@ from spherloc.cameras.extensions import Reader, reader_of
 from spherloc.datasets.scene_file import SceneKind, load_scene, loader_of, read_table, scene_kind
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.errors import CalibrationError, InputError, ProblemError, show
-from spherloc.estimators.base import Clock, Outcome, estimator_of, outcome_faults, run_estimator
+from spherloc.estimators.base import Clock, Estimate, estimator_of, outcome_faults, run_estimator
 from spherloc.files import read_file
 from spherloc.geometry import pose, so3_exp
 from spherloc.metrics import evaluate, rotation_error_deg, translation_error_m
@@ -380,7 +380,7 @@ def check_estimator(estimator: str | Any) -> None:
     """
     name = estimator if isinstance(estimator, str) else name_of(estimator)
     subject = Subject(f"the estimator {show(name)}")
-    kept = _Kept(estimator_of(estimator) if isinstance(estimator, str) else estimator, subject)
+    kept = _CheckedEstimator(estimator_of(estimator) if isinstance(estimator, str) else estimator, subject)
     kept.check_options()
     camera = Equirectangular(2048, 1024)
     easy = SyntheticScene("easy", camera, 60, 0.2, 0.5, 0, field_of_view_deg=100.0)
@@ -403,7 +403,7 @@ def check_estimator(estimator: str | Any) -> None:
         except AssertionError:
             raise
         except Exception as error:
-            subject.fail(f"raises {error!r} of {what}; return an Outcome without a pose and the reason")
+            subject.fail(f"raises {error!r} of {what}; return an Estimate without a pose and the reason")
     watch = _Impatient()
     try:
         kept.solve(problem, 0, watch)
@@ -442,7 +442,7 @@ class _Impatient(Watch):
         self.cancel()
 
 
-class _Kept:
+class _CheckedEstimator:
     """An estimator whose outcomes are checked."""
 
     def __init__(self, estimator: Any, subject: Subject) -> None:
@@ -469,7 +469,7 @@ class _Kept:
     def solve(self, problem: Problem, seed: int, watch: Watch | None = None) -> Trace:
         return run_estimator(self, "checked", problem, None, seed, watch)
 
-    def run(self, aligned: AlignedProblem, options: Any, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
+    def run(self, aligned: AlignedProblem, options: Any, bounds: Bounds, seed: int, clock: Clock) -> Estimate:
         outcome, subject = self._estimator.run(aligned, options, bounds, seed, clock), self._say
         faults = outcome_faults(outcome, len(aligned.index))
         subject.need(not faults, f"returns {' and '.join(faults)} of a wrong form")

@@ -22,7 +22,7 @@ from spherloc_viz import style
 from spherloc_viz.app.matches import match_drawing as drawing
 from spherloc_viz.app.matches.image_panel import MAX_BYTES, ImagePanel, photo_uri
 from spherloc_viz.app.matches.match_card import CROP_HEIGHT_PX, CROP_WIDTH_PX, SIDE_PX, MatchCard, crops_html
-from spherloc_viz.app.matches.match_table import MatchTable
+from spherloc_viz.app.matches.match_table import MatchTablePanel
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.matches import match_view, valid_outlines
@@ -99,7 +99,7 @@ def test_photographs_are_sent_once_and_dots_anew(server: viser.ViserServer, page
 
 def test_nothing_is_sent_when_nothing_changed(server: viser.ViserServer, page: Page, images: Trace) -> None:
     view, kept = panel(server, page), np.arange(60)
-    table, card = MatchTable(server.gui, page.touches, page.changed), MatchCard(server.gui)
+    table, card = MatchTablePanel(server.gui, page.touches, page.changed), MatchCard(server.gui)
     for _ in range(2):
         view.draw(images, outcome(images), (3,), kept)
         table.draw(images, (3,), kept)

@@ -15,7 +15,7 @@ from spherloc.trace import Trace
 from spherloc_viz import style
 from spherloc_viz.app.matches.image_panel import ImagePanel
 from spherloc_viz.app.matches.match_card import MatchCard
-from spherloc_viz.app.matches.match_table import PAGE, MatchTable
+from spherloc_viz.app.matches.match_table import PAGE, MatchTablePanel
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint
 
@@ -104,12 +104,12 @@ def test_the_card_follows_run_and_rival(server: viser.ViserServer, trace: Trace)
 # The table ----------------------------------------------------------------------------------------------------------
 
 
-def numbers(table: MatchTable) -> list[int]:
+def numbers(table: MatchTablePanel) -> list[int]:
     return [int(number) for number in re.findall(r'<tr tabindex="0" data-touch="select:(\d+)"', table._html.content)]
 
 
 def test_pages_filters_and_sorting(server: viser.ViserServer, page: Page, trace: Trace) -> None:
-    table, kept = MatchTable(server.gui, page.touches, page.changed), np.arange(60) + 10
+    table, kept = MatchTablePanel(server.gui, page.touches, page.changed), np.arange(60) + 10
 
     def press(action: str) -> list[int]:
         page.press(action)
@@ -134,7 +134,7 @@ def test_pages_filters_and_sorting(server: viser.ViserServer, page: Page, trace:
 
 
 def test_selected_rows_are_marked_and_brought_up(server: viser.ViserServer, page: Page, trace: Trace) -> None:
-    table, kept = MatchTable(server.gui, page.touches, page.changed), np.arange(60)
+    table, kept = MatchTablePanel(server.gui, page.touches, page.changed), np.arange(60)
     table.draw(trace, (55,), kept)
     mark = f"background:{style.css(style.SELECTED)}"
     assert 55 in numbers(table) and table._html.content.count(mark) == 1
@@ -146,7 +146,7 @@ def test_selected_rows_are_marked_and_brought_up(server: viser.ViserServer, page
 
 
 def test_without_truth_there_is_no_wrong_or_right(server: viser.ViserServer, page: Page, trace: Trace) -> None:
-    table = MatchTable(server.gui, page.touches, page.changed)
+    table = MatchTablePanel(server.gui, page.touches, page.changed)
     blind = replace(trace, problem=replace(trace.problem, truth_cam_from_map=None, truth_inliers=None))
     table.draw(blind, (), np.arange(60))
     assert "wrongly" not in table._html.content and "–" in table._html.content
@@ -154,7 +154,7 @@ def test_without_truth_there_is_no_wrong_or_right(server: viser.ViserServer, pag
 
 def test_a_run_without_a_pose_still_lists_its_matches(server: viser.ViserServer, page: Page, trace: Trace) -> None:
     table, view, card = (
-        MatchTable(server.gui, page.touches, page.changed),
+        MatchTablePanel(server.gui, page.touches, page.changed),
         ImagePanel(server.gui, page.touches, page.changed),
         MatchCard(server.gui),
     )

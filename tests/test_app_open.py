@@ -15,7 +15,7 @@ from spherloc.datasets.correspondences import CorrespondencesScene
 from spherloc.errors import InputError
 from spherloc_viz.app.panels.folders import MAX_ENTRIES, PAGE, Roots
 from spherloc_viz.app.panels.open_panel import MAX_RECENT, RecentScenes
-from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_ROWS, File, Form, Scratch, numbers, open_upload
+from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_ROWS, File, Scratch, UploadForm, numbers, open_upload
 from tests.needs import real_data
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -193,7 +193,7 @@ def test_a_damaged_list_is_ignored_with_a_remark(tmp_path: Path, content: bytes)
     assert recent.read() == ((tmp_path / "a.toml",), "")
 
 
-def form(**changes: object) -> Form:
+def form(**changes: object) -> UploadForm:
     values = {
         "matches": File("my matches.csv", CSV.encode()),
         "calibration": File("camera.toml", CAMERA.encode()),
@@ -202,7 +202,7 @@ def form(**changes: object) -> Form:
         "gravity_bound_deg": "",
         "truth": "",
     }
-    return Form(**values | changes)  # type: ignore[arg-type]
+    return UploadForm(**values | changes)  # type: ignore[arg-type]
 
 
 def test_an_upload_becomes_a_scene(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import viser
 
-from spherloc_viz.app.panels.open_panel import Opened, OpenPanel, RecentScenes
+from spherloc_viz.app.panels.open_panel import OpenedScene, OpenPanel, RecentScenes
 from spherloc_viz.app.panels.uploads import MAX_BYTES
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
@@ -39,7 +39,7 @@ class Visitor:
 
     def __init__(self, server: viser.ViserServer, folder: Path, recent: Path) -> None:
         self.page = ConnectedPage(server, KEY)
-        self.opened: list[Opened] = []
+        self.opened: list[OpenedScene] = []
         self.touches = Touches(self._failed)
         client = self.page.handle
         self.panel = OpenPanel(

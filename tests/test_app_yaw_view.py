@@ -29,8 +29,8 @@ from spherloc_viz.layers.yaw_story import (
     KINDS,
     MAX_BARS,
     MAX_CHOSEN,
-    Arcs,
-    Bars,
+    ArcBars,
+    PairArcs,
     Window,
     arcs_of,
     at_step,
@@ -134,7 +134,7 @@ def test_all_arcs_of_a_window_are_counted_by_their_kind(runs: dict[str, Trace], 
     assert stage is not None and truth is not None
     bars = bars_in(run, arcs_of(run, ()), window, ())
     some = np.arange(0, len(stage.lo_rad), 7)
-    thinned = Arcs(stage.pairs[some], stage.lo_rad[some], stage.hi_rad[some], "")
+    thinned = PairArcs(stage.pairs[some], stage.lo_rad[some], stage.hi_rad[some], "")
     total = [0, 0, 0]
     for pair, lo, hi in zip(thinned.pairs, np.degrees(thinned.lo_rad), np.degrees(thinned.hi_rad), strict=True):
         total[2 - int(truth[pair].sum())] += inside_by_sampling(lo, hi, window)
@@ -161,7 +161,7 @@ def test_bars_of_a_row_never_touch(arcs: list[tuple[float, float]], low: float, 
     pairs = np.column_stack([np.zeros(count, int), 1 + np.arange(count)])
     truth = np.arange(count + 1) % 3 != 1
     run: Any = SimpleNamespace(problem=SimpleNamespace(truth_inliers=truth), inlier_mask=truth)
-    bars = bars_in(run, Arcs(pairs, np.radians(lo), np.radians(lo + span), ""), window, (), most=1000)
+    bars = bars_in(run, PairArcs(pairs, np.radians(lo), np.radians(lo + span), ""), window, (), most=1000)
     arc, left, right = spans_in(bars.lo_deg, bars.hi_deg, window)
     assert np.all(left <= right) and np.all(left >= low) and np.all(right <= window[1])
     assert set(arc.tolist()) == set(np.flatnonzero(bars.row >= 0).tolist()) and len(set(arc.tolist())) == sum(
@@ -405,5 +405,5 @@ def test_few_matches_and_unseen_pixels_are_no_trouble(server: viser.ViserServer,
     for estimator in ("mc-exact", "ransac-2p"):
         run = estimate(replace(problem, pixels=pixels), estimator)
         view.draw(run, "", (0, 1, 5), np.arange(12))
-        bars: Bars = bars_in(run, arcs_of(run, (0, 1, 5)), ALL, (0, 1, 5))
+        bars: ArcBars = bars_in(run, arcs_of(run, (0, 1, 5)), ALL, (0, 1, 5))
         assert bars.pairs.min() >= 3 and "keeps no arcs" in view._html.content

@@ -11,7 +11,7 @@ import pytest
 from spherloc import registry
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import CalibrationError
-from spherloc.estimators.base import Outcome
+from spherloc.estimators.base import Estimate
 from spherloc.estimators.ransac import TwoPointRansac
 from spherloc.refine import RefinementOptions
 from spherloc.solvers.svd import Svd
@@ -188,19 +188,19 @@ class Deaf(TwoPointRansac):
 class Silent(TwoPointRansac):
     @staticmethod
     def run(aligned, options, bounds, seed, clock):
-        return Outcome((), None, np.zeros(len(aligned.index), dtype=bool))
+        return Estimate((), None, np.zeros(len(aligned.index), dtype=bool))
 
 
 class Integral(TwoPointRansac):
     @staticmethod
     def run(aligned, options, bounds, seed, clock):
-        return Outcome((), np.eye(3, 4), np.zeros(len(aligned.index)))
+        return Estimate((), np.eye(3, 4), np.zeros(len(aligned.index)))
 
 
 class Lost(TwoPointRansac):
     @staticmethod
     def run(aligned, options, bounds, seed, clock):
-        return Outcome((), np.eye(3, 4), np.zeros(len(aligned.index), dtype=bool))
+        return Estimate((), np.eye(3, 4), np.zeros(len(aligned.index), dtype=bool))
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ ESTIMATORS = '''
 """Estimators that work, that fail, and that return what nobody knows; and layers that do so."""
 from dataclasses import dataclass, field
 import numpy as np
-from spherloc.estimators.base import Outcome
+from spherloc.estimators.base import Estimate
 from spherloc.refine import RefinementOptions
 from spherloc.trace import RansacStage, Stage, YawStage
 
@@ -61,7 +61,7 @@ DRAWN = {name: stage_of(name) for name in (
 
 def outcome(aligned, *stages, mask=None):
     mask = np.ones(len(aligned.index), dtype=bool) if mask is None else mask
-    return Outcome(stages, np.eye(3, 4), mask)
+    return Estimate(stages, np.eye(3, 4), mask)
 
 
 class Odd:

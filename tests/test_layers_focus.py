@@ -65,7 +65,7 @@ def ends(picture: Picture, name: str) -> FloatArray:
     raise AssertionError(name)
 
 
-def on_screen(view: views.View, places: FloatArray, aspect: float) -> FloatArray:
+def on_screen(view: views.Viewpoint, places: FloatArray, aspect: float) -> FloatArray:
     """Where places are seen: (K, 2), -1 to 1 within the canvas."""
     return views.projected(view, places) / (np.tan(view.field_of_view_rad / 2) * np.array([aspect, 1.0]))
 
@@ -113,7 +113,7 @@ def test_balls_are_large_enough_to_be_seen(aspect: float) -> None:
                 toward = yaw_rotation(turn) @ np.array([0.5, -0.6, 0.5])
                 place, target = views._fits(picture.focus.points, toward[None], aspect)
                 depth = (place[0] - shown.centers) @ (place[0] - target[0]) / np.linalg.norm(place[0] - target[0])
-                over = on_screen(views.View(place[0], target[0]), shown.centers, aspect)[:, 1]
+                over = on_screen(views.Viewpoint(place[0], target[0]), shown.centers, aspect)[:, 1]
                 reach = shown.radii_m / depth / np.tan(views.FIELD_OF_VIEW_RAD / 2)
                 assert np.all(np.abs(over) + reach < 1.15), heading.key
 

@@ -20,7 +20,7 @@ from spherloc_viz.layers.frame import RunView
 from spherloc_viz.layers.primitives import Balls, Label, Picture, Points, SceneItem, Segments, true_minus
 from spherloc_viz.layers.ransac import MAX_IMPROVEMENTS
 from spherloc_viz.layers.translation import BallSet
-from spherloc_viz.layers.yaw import Arcs
+from spherloc_viz.layers.yaw import StageArcs
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +152,7 @@ def test_growing_arcs_overlap_as_often_as_they_say(mc: Trace) -> None:
     assert len(keys) >= 4
     for key in keys:
         size, picture = int(key.split("-")[-1]), at(mc, key)
-        arcs = Arcs(stage).spread(size)
+        arcs = StageArcs(stage).spread(size)
         assert before < set(arcs.tolist()) and len(set(arcs.tolist())) == size
         before = set(arcs.tolist())
         most = covering(stage, arcs, stage.lo_rad[arcs]).max()

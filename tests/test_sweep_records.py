@@ -15,7 +15,7 @@ from spherloc.experiments.sweep import Entrant, Job, planned, run_sweep, solve
 from spherloc.experiments.sweep_rows import Point
 from spherloc.trace import Trace
 from spherloc_viz.commands.run import Records
-from spherloc_viz.commands.sweep import Recorded, sweep
+from spherloc_viz.commands.sweep import SweepRecordings, sweep
 from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
@@ -126,7 +126,7 @@ def test_where_nothing_can_be_recorded_the_sweep_goes_on_and_says_it_once(
     (tmp_path / "file").write_text("in the way")
     plan = planned(SCENE, "noise_px", [1.0], [Entrant("ransac-2p")], 3, Variation(correspondences=20))
     with RecordingStore(tmp_path / "file", print) as store:
-        recorded = Recorded(store)
+        recorded = SweepRecordings(store)
         solved = solve(plan, list(plan.jobs()), recorded.keep(cluster=False))
         assert len(solved.rows) == len(solved.complaints) == 3
         for sentence in solved.complaints:

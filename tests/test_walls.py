@@ -9,6 +9,7 @@ import ast
 import functools
 import subprocess
 import sys
+from collections import defaultdict
 from pathlib import Path
 
 import networkx as nx
@@ -231,6 +232,16 @@ def test_painters_are_kept_apart(room, names, why):
         if any(inside(name, forbidden) for forbidden in names)
     ]
     assert not broken, f"{why}:\n" + "\n".join(broken)
+
+
+def test_no_two_classes_have_one_name():
+    where = defaultdict(list)
+    for module, path in MODULES.items():
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef):
+                where[node.name].append(module)
+    assert len(where) > 100
+    assert {name: modules for name, modules in where.items() if len(modules) > 1} == {}
 
 
 def test_walls_would_be_noticed(monkeypatch, tmp_path):

@@ -228,7 +228,7 @@ def _write_upload(folder: Path) -> None:
 
 
 def _read_upload(folder: Path, damaged: Path) -> object:
-    from spherloc_viz.app.panels.uploads import MAX_BYTES, File, Form, open_upload
+    from spherloc_viz.app.panels.uploads import MAX_BYTES, File, UploadForm, open_upload
 
     def content(name: str) -> bytes:
         path = folder / name
@@ -240,7 +240,7 @@ def _read_upload(folder: Path, damaged: Path) -> object:
     target.mkdir()
     gravity = content("gravity").decode("utf-8", "replace")
     files = (File(f"m\u202e{'x' * 300}.csv", content("matches.csv")), File("../../c", content("calibration")))
-    return open_upload(Form(*files, gravity, "0 0 -1", "1", ""), target)[1].problem()
+    return open_upload(UploadForm(*files, gravity, "0 0 -1", "1", ""), target)[1].problem()
 
 
 def _write_recordings(folder: Path) -> None:

@@ -14,12 +14,12 @@ from spherloc.consensus.pose_search import (
     EFFORT,
     HALT,
     SPLITS,
-    Room,
+    SearchMemory,
     put_off,
     room_for,
     search_poses,
 )
-from spherloc.consensus.stabbing import EVERYWHERE, Scratch, deepest, find_windows, keep_possible, scratch_for
+from spherloc.consensus.stabbing import EVERYWHERE, StabbingMemory, deepest, find_windows, keep_possible, scratch_for
 from spherloc.kernel_cache import kernel
 from spherloc.small_arrays import copy_vector
 from spherloc.types import FloatArray
@@ -58,9 +58,9 @@ class Memory(NamedTuple):
 
     boxes: Boxes
     """That wait."""
-    scratch: Scratch
+    scratch: StabbingMemory
     """Of one box."""
-    room: Room
+    room: SearchMemory
     """Of the search of one small cell."""
     splits: Splits
     """For the picture."""
@@ -97,7 +97,7 @@ def _yaw_of_turn(turn):
 def _in_window(scratch, kept, count, start, end, out):
     """Write those of ``count`` matches in ``kept`` (K,) whose interval meets a window of turns to ``out`` (K,).
 
-    The intervals are those of ``scratch``, a ``Scratch``; the window goes from ``start`` to ``end``, turns. Returns how
+    The intervals are those of ``scratch``, a ``StabbingMemory``; the window goes from ``start`` to ``end``, turns. Returns how
     many.
     """
     used = 0

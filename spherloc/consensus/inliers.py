@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from spherloc.gauss_newton import Matches
+from spherloc.gauss_newton import AlignedMatches
 from spherloc.kernel_cache import kernel
 from spherloc.small_arrays import fill_vector
 
 
 @kernel()
 def count_inliers(yaw, translation, matches, bound_px):
-    """How many ``matches`` (``gauss_newton.Matches``) a level pose explains: a yaw, rad, and a translation (3,), m.
+    """How many ``matches`` (``AlignedMatches``) a level pose explains: a yaw, rad, and a translation (3,), m.
 
     Those in front whose first-order reprojection error, as in ``refine``, is within ``bound_px`` (M,).
     """
@@ -33,7 +33,7 @@ def count_inliers(yaw, translation, matches, bound_px):
 def score_inliers(yaw, translation, matches, bound_px, mask):
     """Fill ``mask`` (M,) with what ``count_inliers`` counts; return how many, and the MSAC support.
 
-    The pose is level: ``yaw``, rad, and ``translation`` (3,), m. ``matches`` are ``Matches``, ``bound_px`` (M,) their
+    The pose is level: ``yaw``, rad, and ``translation`` (3,), m. ``matches`` are ``AlignedMatches``, ``bound_px`` (M,) their
     bounds. The support is the sum of 1 - (error / bound)^2 over the inliers, so that M - support is the MSAC cost in
     units of the squared bound (Torr and Zisserman, "MLESAC", 2000).
     """
@@ -61,7 +61,7 @@ def mark_each(yaws, translations, bearings, points, pixel_jacobian, bound_px):
 
     Of matches with ``bearings`` (M, 3), ``points`` (M, 3), m, ``pixel_jacobian`` (M, 2, 3) and ``bound_px`` (M,).
     """
-    matches = Matches(bearings, points, pixel_jacobian)
+    matches = AlignedMatches(bearings, points, pixel_jacobian)
     masks = np.empty((len(yaws), len(points)), np.bool_)
     for k in range(len(yaws)):
         score_inliers(yaws[k], translations[k], matches, bound_px, masks[k])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from spherloc.bounds import Bounds
 from spherloc.consensus.inliers import count_inliers
 from spherloc.consensus.pair_arcs import chord
-from spherloc.gauss_newton import Matches
+from spherloc.gauss_newton import AlignedMatches
 from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.small_arrays import copy_matrix, copy_vector, fill_matrix, fill_vector
@@ -284,7 +284,7 @@ def _propose(matches, clique, pose):
     The clique has numbers of ``matches``, ``BoundedMatches``; the level ``pose`` (5,) is written.
     """
     bearings, points = matches.bearings, matches.points
-    few = Matches(np.empty((len(clique), 3)), np.empty((len(clique), 3)), np.empty((len(clique), 2, 3)))
+    few = AlignedMatches(np.empty((len(clique), 3)), np.empty((len(clique), 3)), np.empty((len(clique), 2, 3)))
     bound_px = np.empty(len(clique))
     for index in range(len(clique)):
         copy_vector(bearings[clique[index]], few.bearings[index])

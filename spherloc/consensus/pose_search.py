@@ -67,7 +67,7 @@ off."""
 STATE = 8
 
 
-class Room(NamedTuple):
+class SearchMemory(NamedTuple):
     """Memory of one search."""
 
     lower: FloatArray
@@ -108,9 +108,9 @@ class Limits(NamedTuple):
     """Mean movement of the directions in a box below which derivatives are used."""
 
 
-def room_for(count: int) -> Room:
+def room_for(count: int) -> SearchMemory:
     """Memory for ``count`` matches."""
-    return Room(
+    return SearchMemory(
         np.empty((MAX_WAITING, 6)),
         np.empty((MAX_WAITING, 6)),
         np.empty((MAX_WAITING, 3), np.int64),
@@ -362,7 +362,7 @@ def search_poses(matches, cell_of, members, room, limits, found, board):
     """Split a cell until no part may explain more than the best pose and ``limits.gap``.
 
     The cell is ``cell_of`` = (chart, lower (6,), upper (6,)); ``members`` (K,) are all of ``matches``,
-    ``PackedMatches``, that may be explained in it. ``room`` is a ``Room``, ``limits`` are ``Limits``. ``found`` is
+    ``PackedMatches``, that may be explained in it. ``room`` is a ``SearchMemory``, ``limits`` are ``Limits``. ``found`` is
     (best_at, state, left): better poses go to ``best_at`` (7,), chart and parameters, and to ``state``; where the
     effort ends, cells go to ``left``. A watch's ``board`` can end it too.
     """

@@ -51,7 +51,7 @@ EVERYWHERE = 8.0
 """End of an interval that is the whole circle."""
 
 
-class Scratch(NamedTuple):
+class StabbingMemory(NamedTuple):
     """Room for one cell, M matches."""
 
     starts: FloatArray
@@ -72,10 +72,10 @@ class Scratch(NamedTuple):
     """(M,) last ends in deep bins, by bin."""
 
 
-def scratch_for(count: int) -> Scratch:
+def scratch_for(count: int) -> StabbingMemory:
     """Room for cells of ``count`` matches."""
     turns, bins = np.empty((4, count)), np.empty((3, MANY_BINS), np.int32)
-    return Scratch(turns[0], turns[1], np.empty((MAX_WINDOWS, 2)), bins[0], bins[1], bins[2], turns[2], turns[3])
+    return StabbingMemory(turns[0], turns[1], np.empty((MAX_WINDOWS, 2)), bins[0], bins[1], bins[2], turns[2], turns[3])
 
 
 @kernel(error_model="numpy")
@@ -155,7 +155,7 @@ def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
 def deepest(scratch, count, free, cutoff, yaw_bound):
     """Most of ``count`` intervals over one yaw; where that does not exceed ``cutoff``, a bound on it.
 
-    The intervals are those of ``scratch``, a ``Scratch``; ``free`` of them are the whole circle. Yaws where
+    The intervals are those of ``scratch``, a ``StabbingMemory``; ``free`` of them are the whole circle. Yaws where
     ``yaw_bound`` (B,), for bins of turn, does not exceed ``cutoff`` are left out if bins show that nothing else exceeds
     it.
     """
@@ -230,7 +230,7 @@ def _bin(turn, bins):
 def _count(scratch, count, free):
     """Count the ends of ``count`` intervals by bin, ``free`` of them being the whole circle.
 
-    They are those of ``scratch``, a ``Scratch``. Returns how many bins there are, and the depth at the end of the
+    They are those of ``scratch``, a ``StabbingMemory``. Returns how many bins there are, and the depth at the end of the
     circle.
     """
     starts, ends, opened, closed, before = scratch.starts, scratch.ends, scratch.opened, scratch.closed, scratch.before
@@ -253,7 +253,7 @@ def _count(scratch, count, free):
 def _sort_ends(scratch, count, bins, cutoff):
     """Sort the ends of ``count`` intervals in deep ``bins``, those that more than ``cutoff`` intervals touch.
 
-    All are in ``scratch``, a ``Scratch``: ``opened`` and ``closed`` become where those of each end in ``opening`` and
+    All are in ``scratch``, a ``StabbingMemory``: ``opened`` and ``closed`` become where those of each end in ``opening`` and
     ``closing``; -1 of other bins, where the depth does not exceed ``cutoff``.
     """
     starts, ends, opened, closed, before = scratch.starts, scratch.ends, scratch.opened, scratch.closed, scratch.before

@@ -17,7 +17,7 @@ import numpy as np
 
 from spherloc.consensus.inliers import BLOCK, pack_blocks, reaches, score_inliers
 from spherloc.consensus.level_pose import fit, write_level_pose, write_translation
-from spherloc.gauss_newton import Matches
+from spherloc.gauss_newton import AlignedMatches
 from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.small_arrays import copy_matrix, copy_vector
@@ -83,7 +83,7 @@ def search_two_point(
     watch = watch or Watch()
     watch.expect(iterations)
     log, drawn, reached = _search(
-        Matches(aligned.bearings, aligned.points, aligned.pixel_from_bearing),
+        AlignedMatches(aligned.bearings, aligned.points, aligned.pixel_from_bearing),
         np.array(bound_px),  # a copy: for a read-only array numba would compile the kernel once more
         np.uint64(seed),
         iterations,
@@ -184,7 +184,7 @@ def _set_floors(floors, target, count, miss):
 def _optimize(yaw, translation, matches, bound_px, mask):
     """Fit yaw, rad (returned), and translation (3,), m (in place), to the inliers, choose these anew, and so on.
 
-    ``matches`` are ``gauss_newton.Matches``, ``bound_px`` (M,); ``mask`` (M,) is written.
+    ``matches`` are ``gauss_newton.AlignedMatches``, ``bound_px`` (M,); ``mask`` (M,) is written.
 
     The pose of two noisy correspondences explains those around them; each fit reaches farther. A wider bound at first
     would reach farther still, but where gravity's error has widened the bounds it lets in too many false ones
@@ -205,7 +205,7 @@ def _optimize(yaw, translation, matches, bound_px, mask):
 def _search(matches, bound_px, seed, iterations, miss, msac, local, board):
     """Rows (sample, i, j, yaw, translation, inliers, optimized) of all improvements, samples drawn, confidence reached.
 
-    ``matches`` are ``gauss_newton.Matches``, ``bound_px`` (M,), ``seed`` is uint64; at most ``iterations`` samples are
+    ``matches`` are ``AlignedMatches``, ``bound_px`` (M,), ``seed`` is uint64; at most ``iterations`` samples are
     drawn; ``miss`` is 1 - confidence, or NaN to draw them all; ``msac`` and ``local`` are switches. Rows (J, 9) are
     float64. A watch's ``board`` counts the samples and can end it.
     """

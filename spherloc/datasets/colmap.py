@@ -19,7 +19,7 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import CalibrationError, InputError, shorten, show
 from spherloc.files import is_file
 from spherloc.formats.colmap_files import read_model
-from spherloc.formats.colmap_model import ColmapImage, ColmapModel, Points
+from spherloc.formats.colmap_model import ColmapImage, ColmapModel, ModelPoints
 from spherloc.frontend.lifting import SfmLift
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
@@ -106,7 +106,7 @@ def without_queries(model: ColmapModel, queries: Collection[str], where: str) ->
         raise InputError(
             f"{where}: no point of the model can be used: {reason}; name fewer queries, or add images to the model."
         )
-    kept = Points(points.ids[stay], points.xyz[stay], points.errors_px[stay], points.track_lengths[stay])
+    kept = ModelPoints(points.ids[stay], points.xyz[stay], points.errors_px[stay], points.track_lengths[stay])
     gone = np.count_nonzero(~stay)
     return replace(model, points=kept), [f"{gone:,} of {len(stay):,} points of the model left out: {reason}."]
 

@@ -26,7 +26,7 @@ from spherloc.formats.colmap_files import read_model
 from spherloc.formats.colmap_model import ColmapModel
 from spherloc.formats.hloc_files import (
     Hdf5,
-    Keypoints,
+    HlocKeypoints,
     open_hdf5,
     read_global_descriptors,
     read_keypoints,
@@ -79,7 +79,7 @@ class HlocMatcher:
             if keypoints is None:
                 raise InputError(f"{self.features}: has no keypoints of {show(query.name)}; extract its features.")
             _check_size(query, keypoints, self.features)
-            found = _Found()
+            found = _QueryMatches()
             for name in self.pairs.get(query.name, ()):
                 try:
                     pair = self._pair(features, matches, query.name, len(keypoints.pixels), self.references[name])
@@ -109,7 +109,7 @@ class HlocMatcher:
 
 
 @dataclass(eq=False)
-class _Found:
+class _QueryMatches:
     """The matches that the pairs of a query gave so far."""
 
     pairs: list[_Pair] = field(default_factory=list)
@@ -123,7 +123,7 @@ class _Found:
         else:
             self.pairs.append(pair)
 
-    def matches(self, query: View, keypoints: Keypoints, file: Path) -> Matches:
+    def matches(self, query: View, keypoints: HlocKeypoints, file: Path) -> Matches:
         """All matches as correspondences; the reference with the most of them counts as the most similar one."""
         pairs = sorted(self.pairs, key=lambda pair: -len(pair.keypoints))
         index = _joined([pair.keypoints for pair in pairs], (0,), np.int64)
@@ -140,7 +140,7 @@ class _Found:
             remarks=tuple(self._remarks(query, keypoints, file)),
         )
 
-    def _remarks(self, query: View, keypoints: Keypoints, file: Path) -> list[str]:
+    def _remarks(self, query: View, keypoints: HlocKeypoints, file: Path) -> list[str]:
         count = len(self.pairs) + len(self.faults) + self.unmatched
         remarks = []
         if not count:
@@ -166,7 +166,7 @@ def _joined(parts: list, shape: tuple[int, ...], dtype: type) -> np.ndarray:
     return np.concatenate([np.empty(shape, dtype), *parts])
 
 
-def _check_size(query: View, keypoints: Keypoints, file: Path) -> None:
+def _check_size(query: View, keypoints: HlocKeypoints, file: Path) -> None:
     size = (query.camera.width, query.camera.height)
     if keypoints.image_size not in (None, size):
         width, height = keypoints.image_size or size

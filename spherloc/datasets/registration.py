@@ -51,7 +51,7 @@ class Registration(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Surfaces:
+class SurfacePoints:
     """Points of surfaces and their normals."""
 
     points: FloatArray
@@ -80,13 +80,13 @@ class DepthRegistration:
         points = np.concatenate([found.points for found in maps])
         normals = np.concatenate([found.normals for found in maps])
         rotation = cam_from_map[:, :3].T
-        start = Surfaces(
+        start = SurfacePoints(
             transform(pose(rotation, -rotation @ cam_from_map[:, 3]), own.points), own.normals @ rotation.T
         )
-        return registration_error_m(start, Surfaces(points, normals), np.array(self.gravity_map))
+        return registration_error_m(start, SurfacePoints(points, normals), np.array(self.gravity_map))
 
 
-def surfaces(camera: Camera, lift: Lift) -> Surfaces:
+def surfaces(camera: Camera, lift: Lift) -> SurfacePoints:
     """The surfaces around a camera that a lift gives points of, in the lift's own frame."""
     pixels, seen = camera.project(_sphere(SAMPLES))
     pixels = pixels[seen & in_image(camera, pixels)]
@@ -95,10 +95,10 @@ def surfaces(camera: Camera, lift: Lift) -> Surfaces:
     across = np.cross(right - here, below - here)
     length = np.linalg.norm(across, axis=1)
     good = known & right_known & below_known & (length > 0)
-    return Surfaces(here[good], across[good] / length[good, None])
+    return SurfacePoints(here[good], across[good] / length[good, None])
 
 
-def registration_error_m(start: Surfaces, fixed: Surfaces, down: FloatArray) -> float:
+def registration_error_m(start: SurfacePoints, fixed: SurfacePoints, down: FloatArray) -> float:
     """RMS distance (metres) by which ICP moves ``start`` until it fits ``fixed``; inf if it does not fit.
 
     ``down`` is the unit vector (3,) of gravity.

@@ -61,7 +61,7 @@ occluders = 6
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class RenderedPicture:
     """A picture by all that determines it, and its name."""
 
     name: str
@@ -96,7 +96,7 @@ class Picture:
 class RenderedView(View):
     """A view whose file is drawn when it is first needed."""
 
-    picture: Picture
+    picture: RenderedPicture
 
     def read(self) -> ByteArray:
         """See ``View``."""
@@ -145,7 +145,7 @@ def _references(table: Mapping[str, Any], where: str, world: World, camera: Came
     conditions = _conditions(table, where)
     views = []
     for number, place in enumerate(_poses(table, where, world)):
-        picture = Picture(f"reference_{number:03d}", world, camera, place, conditions, number)
+        picture = RenderedPicture(f"reference_{number:03d}", world, camera, place, conditions, number)
         lift = DepthLift(picture.range_m, camera, place, along="ray")
         views.append(_view(picture, lift=lift))
     return tuple(views)
@@ -160,11 +160,11 @@ def _queries(table: Mapping[str, Any], where: str, world: World, camera: Camera)
     for number, place in enumerate(_poses(table, where, world)):
         # Occluders and noise differ from those of the references.
         tilted, seed = _tilted(place, tilt_deg, number), MAX_VIEWS + number
-        views.append(_view(Picture(f"query_{number:03d}", world, camera, tilted, conditions, seed)))
+        views.append(_view(RenderedPicture(f"query_{number:03d}", world, camera, tilted, conditions, seed)))
     return tuple(views), tilt_deg
 
 
-def _view(picture: Picture, lift: DepthLift | None = None) -> RenderedView:
+def _view(picture: RenderedPicture, lift: DepthLift | None = None) -> RenderedView:
     return RenderedView(
         name=picture.name,
         camera=picture.camera,

@@ -10,7 +10,7 @@ import numpy as np
 from spherloc.bounds import Bounds, bounds_of
 from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.consensus.two_point_search import TwoPointSearch, search_two_point
-from spherloc.estimators.base import Clock, Outcome, check_positive
+from spherloc.estimators.base import Clock, Estimate, check_positive
 from spherloc.estimators.mc_exact import MAX_CORRESPONDENCES, ExactMaximumConsensus, McExactOptions
 from spherloc.estimators.ransac import RansacOptions, TwoPointRansac
 from spherloc.free_gravity import Contradiction, contradicts, without_gravity
@@ -53,7 +53,7 @@ class Auto:
     Options = AutoOptions
 
     @staticmethod
-    def run(aligned: AlignedProblem, options: AutoOptions, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
+    def run(aligned: AlignedProblem, options: AutoOptions, bounds: Bounds, seed: int, clock: Clock) -> Estimate:
         """Probe, choose, run what was chosen; its stages follow the decision."""
         with clock.stage("decision"):
             probe = search_two_point(
@@ -89,7 +89,7 @@ class Auto:
             outcome = TwoPointRansac.run(aligned, sampling, bounds, seed, clock)
         if not early and (wrong := _gravity_fault(aligned, outcome.cam_from_map, outcome.inlier_mask, options, clock)):
             return _without_gravity(aligned, wrong, decision, options)
-        return Outcome(
+        return Estimate(
             (decision, *outcome.stages),
             outcome.cam_from_map,
             outcome.inlier_mask,
@@ -132,7 +132,7 @@ def _gravity_fault(
 
 def _without_gravity(
     aligned: AlignedProblem, wrong: Contradiction, decision: DecisionStage, options: AutoOptions
-) -> Outcome:
+) -> Estimate:
     """The outcome where gravity is beyond its bound: the pose that shows it, refined without gravity."""
     more = f": {wrong.support} different matches agree without it, {wrong.believed_support} with it"
     note = (
@@ -145,7 +145,7 @@ def _without_gravity(
         free, [wrong.cam_from_map], bounds_of(free, float(options.bound_px)), replace(options, gravity_sd_deg=np.inf)
     )
     told = replace(decision, reason=f"{decision.reason} {note}")
-    return Outcome((told, refinement), state, mask, note=note)
+    return Estimate((told, refinement), state, mask, note=note)
 
 
 def _probe_samples(aligned: AlignedProblem) -> int:

@@ -26,7 +26,7 @@ REFINEMENT_FIELDS = {item.name for item in fields(RefinementOptions)}
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class Estimate:
     """What an estimator returns to ``estimate``: stages, and the pose and inliers in the aligned frames."""
 
     stages: tuple[Stage, ...]
@@ -51,7 +51,7 @@ class Estimator(Protocol):
     of them."""
 
     @staticmethod
-    def run(aligned: AlignedProblem, options: Any, bounds: Bounds, seed: int, clock: "Clock") -> Outcome:
+    def run(aligned: AlignedProblem, options: Any, bounds: Bounds, seed: int, clock: "Clock") -> Estimate:
         """Solve; take every random draw from ``seed`` and report each stage's time to ``clock``.
 
         What may take longer than some hundredths of a second looks at ``clock.watch`` so often.

@@ -9,7 +9,7 @@ import numpy as np
 
 from spherloc.bounds import Bounds
 from spherloc.errors import InputError
-from spherloc.estimators.base import Clock, Outcome
+from spherloc.estimators.base import Clock, Estimate
 from spherloc.geometry import pose
 from spherloc.problem import AlignedProblem
 from spherloc.ranges import is_number
@@ -65,9 +65,9 @@ class GivenPose:
     Options = GivenPoseOptions
 
     @staticmethod
-    def run(aligned: AlignedProblem, options: GivenPoseOptions, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
+    def run(aligned: AlignedProblem, options: GivenPoseOptions, bounds: Bounds, seed: int, clock: Clock) -> Estimate:
         """Count the correspondences within the bound of the given pose."""
         with clock.stage("inliers"):
             cam_from_map = aligned.align_pose(options.cam_from_map)
             inliers = residuals_px(aligned, cam_from_map) <= options.bound_px
-        return Outcome((), cam_from_map, inliers, note="The pose was given, not searched for.")
+        return Estimate((), cam_from_map, inliers, note="The pose was given, not searched for.")

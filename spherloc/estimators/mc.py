@@ -12,8 +12,8 @@ from spherloc.consensus.max_clique import EFFORT_LIMIT, max_clique
 from spherloc.consensus.translation_balls import edges_of, overlapping, share_of_each, spread_balls
 from spherloc.consensus.yaw_arcs import FULL, YawConsensus, deepest_yaw, yaw_arcs
 from spherloc.errors import InputError
-from spherloc.estimators.base import Clock, Outcome, check_positive, check_switches
-from spherloc.gauss_newton import Matches
+from spherloc.estimators.base import Clock, Estimate, check_positive, check_switches
+from spherloc.gauss_newton import AlignedMatches
 from spherloc.geometry import pose, yaw_rotation
 from spherloc.kernel_cache import kernel
 from spherloc.last_step import conclude, conclude_as_printed
@@ -66,7 +66,7 @@ class MaximumConsensus:
     Options = McOptions
 
     @staticmethod
-    def run(aligned: AlignedProblem, options: McOptions, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
+    def run(aligned: AlignedProblem, options: McOptions, bounds: Bounds, seed: int, clock: Clock) -> Estimate:
         """Algorithm 2; ``seed`` is not used."""
         count = len(aligned.bearings)
         if count > MAX_CORRESPONDENCES:
@@ -83,13 +83,13 @@ class MaximumConsensus:
         if consensus is None:
             enough = "" if options.as_printed else " to within 60 degrees"
             reason = f"No pose: none of {count * (count - 1) // 2} pairs fixes the yaw{enough}."
-            return Outcome((), None, nobody, reason)
+            return Estimate((), None, nobody, reason)
         yaw = _yaw_stage(aligned, options, pairs, lo, hi, consensus, clock.watch)
         with clock.stage("translation", until=0.99):
             translation, start = _locate(aligned, options, bounds, pairs, lo, hi, consensus, clock.watch)
         if translation is None or start is None:
             reason = "No pose: no pair in the rotation clique bounds the camera's position."
-            return Outcome((yaw,), None, nobody, reason)
+            return Estimate((yaw,), None, nobody, reason)
         with clock.stage("refinement", until=1.0):
             if options.as_printed:
                 members = residuals_px(aligned, start) <= bounds.pixels
@@ -97,7 +97,7 @@ class MaximumConsensus:
             else:
                 refined, inliers, refinement = conclude(aligned, [start], bounds, options)
         stages: tuple[Stage, ...] = (yaw, translation, refinement)
-        return Outcome(stages, refined, inliers)
+        return Estimate(stages, refined, inliers)
 
 
 def _yaw_stage(
@@ -192,7 +192,7 @@ def _best_start(
     mean = _mean_start(yaw, centres, radii)
     yaws, translations, exists = two_point(aligned.bearings[pairs], aligned.points[pairs])
     yaws, translations = np.append(yaw, yaws[exists]), np.vstack([mean[:, 3], translations[exists]])
-    matches = Matches(aligned.bearings, aligned.points, aligned.pixel_from_bearing)
+    matches = AlignedMatches(aligned.bearings, aligned.points, aligned.pixel_from_bearing)
     best = _most_inliers(yaws, translations, matches, bounds.pixels)
     return pose(yaw_rotation(float(yaws[best])), translations[best])
 
@@ -201,7 +201,7 @@ def _best_start(
 def _most_inliers(yaws, translations, matches, bound_px):
     """Index of the level pose that explains most correspondences, the first of equals.
 
-    ``yaws`` (J,), rad, ``translations`` (J, 3), m, ``matches`` are ``gauss_newton.Matches``, ``bound_px`` (M,).
+    ``yaws`` (J,), rad, ``translations`` (J, 3), m, ``matches`` are ``gauss_newton.AlignedMatches``, ``bound_px`` (M,).
     """
     count = len(matches.points)
     blocks = pack_blocks(matches, bound_px, np.arange(count))

@@ -23,7 +23,7 @@ from spherloc.consensus.pose_cells import TILT_A, PackedMatches, pack_matches, p
 from spherloc.consensus.positions import PositionSearch, search_positions
 from spherloc.consensus.two_point_search import TwoPointSearch, search_two_point
 from spherloc.errors import InputError
-from spherloc.estimators.base import Clock, Outcome, check_positive
+from spherloc.estimators.base import Clock, Estimate, check_positive
 from spherloc.gauss_newton import MIN_FOR_SIX_DOF, ROBUST_CAUCHY, Noise, polish
 from spherloc.geometry import level_poses, pose, yaw_of, yaw_rotation
 from spherloc.last_step import conclude
@@ -93,7 +93,7 @@ class ExactMaximumConsensus:
     Options = McExactOptions
 
     @staticmethod
-    def run(aligned: AlignedProblem, options: McExactOptions, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
+    def run(aligned: AlignedProblem, options: McExactOptions, bounds: Bounds, seed: int, clock: Clock) -> Estimate:
         """Guess by 2P-RANSAC, search all poses, refine, certify. ``seed`` is that of the RANSAC."""
         count = len(aligned.bearings)
         if count > MAX_CORRESPONDENCES:
@@ -116,7 +116,7 @@ class ExactMaximumConsensus:
         if found.pose is None:
             certificate = Certificate(found.upper, 1, nfa(count, 1, rate))
             reason = "No pose: no pair of correspondences has a solution in front of the camera."
-            return Outcome(stages, None, np.zeros(count, dtype=bool), reason, certificate=certificate)
+            return Estimate(stages, None, np.zeros(count, dtype=bool), reason, certificate=certificate)
         with clock.stage("refinement", until=1.0):
             starts = [
                 found.pose,
@@ -126,7 +126,7 @@ class ExactMaximumConsensus:
             refined, inliers, refinement = conclude(aligned, starts, bounds, options)
         lower = _lower_bound(aligned, bounds, found.pose, refined, refinement.tilt_rad)
         certificate = Certificate(max(found.upper, lower), lower, nfa(count, lower, rate))
-        return Outcome((*stages, refinement), refined, inliers, certificate=certificate)
+        return Estimate((*stages, refinement), refined, inliers, certificate=certificate)
 
 
 @dataclass(frozen=True, eq=False)

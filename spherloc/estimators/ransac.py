@@ -9,7 +9,7 @@ from spherloc.bounds import Bounds
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import Scoring, TwoPointSearch, search_two_point
 from spherloc.errors import InputError, show
-from spherloc.estimators.base import Clock, Outcome, check_positive, check_switches
+from spherloc.estimators.base import Clock, Estimate, check_positive, check_switches
 from spherloc.geometry import level_poses
 from spherloc.last_step import conclude, conclude_as_printed
 from spherloc.problem import AlignedProblem
@@ -58,7 +58,7 @@ class TwoPointRansac:
     Options = RansacOptions
 
     @staticmethod
-    def run(aligned: AlignedProblem, options: RansacOptions, bounds: Bounds, seed: int, clock: Clock) -> Outcome:
+    def run(aligned: AlignedProblem, options: RansacOptions, bounds: Bounds, seed: int, clock: Clock) -> Estimate:
         """Algorithm 1."""
         with clock.stage("ransac", until=0.99):
             search = search_two_point(
@@ -74,7 +74,7 @@ class TwoPointRansac:
             stage = _stage(aligned, bounds, search)
         if not search.found:
             reason = f"No pose: none of {search.drawn} sampled pairs has a solution in front of the camera."
-            return Outcome((stage,), None, np.zeros(len(aligned.bearings), dtype=bool), reason)
+            return Estimate((stage,), None, np.zeros(len(aligned.bearings), dtype=bool), reason)
         with clock.stage("refinement", until=1.0):
             (start,) = level_poses(search.yaws_rad[-1:], search.translations[-1:])
             if options.as_printed:
@@ -82,7 +82,7 @@ class TwoPointRansac:
                 refined, inliers, refinement = conclude_as_printed(aligned, start, members, bounds, options)
             else:
                 refined, inliers, refinement = conclude(aligned, [start], bounds, options)
-        return Outcome((stage, refinement), refined, inliers)
+        return Estimate((stage, refinement), refined, inliers)
 
 
 def _stage(aligned: AlignedProblem, bounds: Bounds, search: TwoPointSearch) -> RansacStage:

@@ -20,7 +20,7 @@ import numpy as np
 
 from spherloc.bounds import Bounds
 from spherloc.errors import InputError, show
-from spherloc.estimators.base import Clock, Outcome, check_positive, check_switches
+from spherloc.estimators.base import Clock, Estimate, check_positive, check_switches
 from spherloc.last_step import conclude, conclude_as_printed
 from spherloc.metrics import ransac_success_probability
 from spherloc.problem import AlignedProblem
@@ -154,7 +154,7 @@ class SolverRansac:
 
     def run(
         self, aligned: AlignedProblem, options: SolverRansacOptions, bounds: Bounds, seed: int, clock: Clock
-    ) -> Outcome:
+    ) -> Estimate:
         """Algorithm 1."""
         if isinstance(options, PinholeRansacOptions):
             whole = options.view_deg == WHOLE_SPHERE_DEG
@@ -166,7 +166,7 @@ class SolverRansac:
 
     def _run(
         self, aligned: AlignedProblem, options: SolverRansacOptions, bounds: Bounds, seed: int, clock: Clock
-    ) -> Outcome:
+    ) -> Estimate:
         view = _view(aligned, bounds, options, self.sampler.pinhole)
         with clock.stage("ransac", until=0.99):
             drawn, found = self._search(view, options, np.random.default_rng(seed), clock.watch)
@@ -178,7 +178,7 @@ class SolverRansac:
             stage = _stage(view, drawn, found, self.sampler.sample_size)
         inlier_mask = np.zeros(len(aligned.bearings), dtype=bool)
         if reason:
-            return Outcome((stage,), None, inlier_mask, " ".join(filter(None, (reason, _lost(view)))))
+            return Estimate((stage,), None, inlier_mask, " ".join(filter(None, (reason, _lost(view)))))
         with clock.stage("refinement", until=1.0):
             start, members = found[-1].cam_from_map, found[-1].mask
             if options.as_printed:
@@ -186,7 +186,7 @@ class SolverRansac:
             else:
                 refined, inliers, refinement = conclude(view.aligned, [start], view.bounds, options)
         inlier_mask[view.seen] = inliers
-        return Outcome((stage, refinement), refined, inlier_mask, note=_lost(view))
+        return Estimate((stage, refinement), refined, inlier_mask, note=_lost(view))
 
     def _search(
         self, view: _View, options: SolverRansacOptions, rng: np.random.Generator, watch: Watch

@@ -49,12 +49,12 @@ def read_queries_of_database(path: Path, model: ColmapModel) -> dict[str, Databa
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
             database.execute("PRAGMA trusted_schema = OFF")
             database.text_factory = lambda text: text.decode("utf-8", errors="replace")
-            return _Reader(path, database).queries(model)
+            return _DatabaseReader(path, database).queries(model)
     except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter from SQLite's messages, which quote the file
         raise InputError(f"{path}: is not a COLMAP database ({show(str(error))}); give its database.db.") from error
 
 
-class _Reader:
+class _DatabaseReader:
     """Reads one database."""
 
     def __init__(self, path: Path, database: sqlite3.Connection) -> None:

@@ -82,7 +82,7 @@ class ColmapImage:
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
+class ModelPoints:
     """Columns of P points, by rising id."""
 
     ids: NDArray[np.int64]
@@ -102,7 +102,7 @@ class ColmapModel:
     folder: Path
     images: Mapping[str, ColmapImage]
     """Images with a pose, by name, in the order of names."""
-    points: Points
+    points: ModelPoints
     """All points, by rising id."""
     raw_cameras: Mapping[int, RawCamera]
     """Cameras as in the file, by camera id."""
@@ -165,7 +165,7 @@ class ModelParts:
     """Number of observations by image id, of all images."""
     names: set[str] = field(default_factory=set)
     """Names of all images."""
-    points: Points = field(init=False)
+    points: ModelPoints = field(init=False)
     """The points; set when they are read, which is last."""
 
     def camera(self, number: int, camera: RawCamera, broken: Broken) -> None:
@@ -242,11 +242,11 @@ class ModelParts:
             raise broken(f"a point has keypoint {places[first]} of image {image_ids[first]}, which does not exist")
 
 
-def make_points(ids: ArrayLike, xyz: ArrayLike, errors_px: ArrayLike, track_lengths: ArrayLike) -> Points:
+def make_points(ids: ArrayLike, xyz: ArrayLike, errors_px: ArrayLike, track_lengths: ArrayLike) -> ModelPoints:
     """Columns in the order of ids."""
     numbers = np.asarray(ids, dtype=np.int64)
     order = np.argsort(numbers, kind="stable")
-    return Points(
+    return ModelPoints(
         ids=numbers[order],
         xyz=np.asarray(xyz, dtype=np.float64).reshape(-1, 3)[order],
         errors_px=np.asarray(errors_px, dtype=np.float64)[order],

@@ -85,7 +85,7 @@ def read_results(path: Path) -> dict[str, FloatArray]:
 
 
 @dataclass(frozen=True, eq=False)
-class Keypoints:
+class HlocKeypoints:
     """The keypoints of one image."""
 
     pixels: FloatArray
@@ -157,7 +157,7 @@ def open_hdf5(path: Path) -> Iterator[Hdf5]:
         yield Hdf5(path, file)
 
 
-def read_keypoints(file: Hdf5, name: str) -> Keypoints | None:
+def read_keypoints(file: Hdf5, name: str) -> HlocKeypoints | None:
     """The keypoints of an image, None if the file has none of it; raises ``InputError`` if they are damaged."""
     array = file.array((name, "keypoints"), "f", 2)
     if array is None:
@@ -169,7 +169,7 @@ def read_keypoints(file: Hdf5, name: str) -> Keypoints | None:
     size = file.array((name, "image_size"), "iuf", 1)
     if size is not None and (len(size) != 2 or not np.isfinite(size).all() or not (size > 0).all()):
         raise InputError(f"{place}: its image_size is not a width and a height; extract the features again.")
-    return Keypoints(
+    return HlocKeypoints(
         pixels=pixels[:, :2] + 0.5,
         rounding_px=float(np.spacing(np.abs(array[:, :2]).max())) if array.size else 0.0,
         uncertainty_px=file.attribute((name, "keypoints"), "uncertainty"),

@@ -122,7 +122,7 @@ class ImageMatcher:
         """See ``Matcher``; if no reference can be used, there are no correspondences, and remarks say why."""
         features = extract(query, self.options.features)
         tried, remarks = self._candidates(query, features)
-        found: list[_Found] = []
+        found: list[_ReferenceMatches] = []
         for reference in tried:
             try:
                 found.append(_correspondences(features, reference, self.options))
@@ -229,7 +229,7 @@ def _index(references: Sequence[View], options: FrontendOptions, report: Report)
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class _ReferenceMatches:
     """Correspondences through one reference."""
 
     reference: View
@@ -247,7 +247,7 @@ class _Found:
         return len(self.pixels) + len(self.unlifted[0])
 
 
-def _correspondences(query: Features, reference: View, options: FrontendOptions) -> _Found:
+def _correspondences(query: Features, reference: View, options: FrontendOptions) -> _ReferenceMatches:
     if reference.lift is None:
         raise InputError("nothing gives its pixels points in the map; give depth, lidar or a model.")
     features = extract(reference, options.features)
@@ -258,7 +258,7 @@ def _correspondences(query: Features, reference: View, options: FrontendOptions)
     if options.matching.method == "nearest" and len(matches):
         binary = KINDS[query.method].binary
         wrong = wrong_matches(len(query), len(matches), options.matching.ratio, binary) * float(lifted.mean())
-    return _Found(
+    return _ReferenceMatches(
         reference=reference,
         pixels=query.pixels[matches.query_index[lifted]],
         points=points[lifted],
@@ -268,7 +268,7 @@ def _correspondences(query: Features, reference: View, options: FrontendOptions)
     )
 
 
-def _verified_unlifted(query: View, part: _Found) -> int:
+def _verified_unlifted(query: View, part: _ReferenceMatches) -> int:
     """Number of matches without a map point that agree with the motion between the query and the reference."""
     lifted, lacking = (part.pixels, part.reference_pixels), part.unlifted
     bearings, seen = query.camera.unproject(np.concatenate([lifted[0], lacking[0]]))
@@ -278,7 +278,9 @@ def _verified_unlifted(query: View, part: _Found) -> int:
     return int(np.count_nonzero(verified(bearings[both], others[both]) & lacks[both]))
 
 
-def _joined(query: View, found: Sequence[_Found], tried: Sequence[View], most: int, remarks: list[str]) -> Matches:
+def _joined(
+    query: View, found: Sequence[_ReferenceMatches], tried: Sequence[View], most: int, remarks: list[str]
+) -> Matches:
     """The matches of at most ``most`` references, those with the most correspondences."""
     found = sorted(found, key=lambda part: -len(part.pixels))[:most]
     ranked = [part for part in found if len(part.pixels)]
@@ -307,7 +309,7 @@ def _joined(query: View, found: Sequence[_Found], tried: Sequence[View], most: i
     )
 
 
-def _outlier_rate(ranked: Sequence[_Found], kept: int) -> float | None:
+def _outlier_rate(ranked: Sequence[_ReferenceMatches], kept: int) -> float | None:
     """Estimated outlier rate of the ``kept`` matches; repetitions, which were left out, count as right ones."""
     if all(part.wrong is None for part in ranked):
         return None

@@ -14,7 +14,7 @@ from spherloc.mapping.positions import Positions, gps_of_images
 from spherloc.mapping.reconstruction import Reconstruction, reconstruct
 from spherloc.mapping.upright import (
     Level,
-    Scale,
+    MapScale,
     Tell,
     arbitrary_scale,
     gravity_by_lines,
@@ -32,7 +32,7 @@ MIN_OF_GROUP = 3
 
 
 @dataclass(frozen=True)
-class Measured:
+class ScaleMeasurement:
     """A measurement that fixes the map's scale: one of these fields or none; GPS in the photographs is used then."""
 
     camera_height_m: float | None = None
@@ -49,7 +49,7 @@ class Map:
 
     made: Reconstruction
     level: Level
-    scale: Scale
+    scale: MapScale
     written: Written
     groups: "tuple[Map, ...]" = ()
     """Maps of other images, which could not be joined with this one."""
@@ -61,7 +61,7 @@ def make_map(
     views: Sequence[View],
     images: Path,
     folder: Path,
-    measured: Measured,
+    measured: ScaleMeasurement,
     new_images: Path | None,
     tell: Tell,
     masks: Masks | None = None,
@@ -90,8 +90,8 @@ def make_map(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); give another --output.") from None
-    if measured == Measured():
-        measured = Measured(positions=gps_of_images(views))
+    if measured == ScaleMeasurement():
+        measured = ScaleMeasurement(positions=gps_of_images(views))
     kept = Kept(masks, how or FrontendOptions())
     gravity = gravity_by_lines(views, tell)
     first, *others = reconstruct(views, [gravity.get(view.name) for view in views], folder, tell, how)
@@ -137,9 +137,9 @@ def _finished(
     views: Sequence[View],
     elsewhere: Collection[str],
     gravity: Mapping[str, Gravity],
-    measured: Measured,
+    measured: ScaleMeasurement,
     tell: Tell,
-) -> tuple[Reconstruction, Level, Scale]:
+) -> tuple[Reconstruction, Level, MapScale]:
     """A model with images added later and without those whose own gravity disagrees; its gravity and its scale."""
     made = made.without(level_of(made.poses, gravity).leaning)
     made = place_rest(made, views, elsewhere, gravity, level_of(made.poses, gravity), tell)
@@ -148,7 +148,7 @@ def _finished(
     return made, level, scale_of(made, level, measured)
 
 
-def scale_of(made: Reconstruction, level: Level, measured: Measured) -> Scale:
+def scale_of(made: Reconstruction, level: Level, measured: ScaleMeasurement) -> MapScale:
     """The scale by ``measured``; arbitrary, with the reason, if that does not fit: the map itself is finished."""
     try:
         if measured.distance is not None:

@@ -43,7 +43,7 @@ MAX_LOG10_NFA = -1.0
 """Largest log10 of the NFA: the number of poses that as many of the matches would fit by chance."""
 
 
-class Pairs:
+class ImagePairs:
     """Images, each with its camera, which are compared in pairs, in any thread."""
 
     def __init__(

@@ -56,7 +56,7 @@ class Positions:
 
 
 @dataclass(frozen=True, eq=False)
-class Overlay:
+class SimilarityFit:
     """A similarity that aligns points with positions."""
 
     scale: float
@@ -211,7 +211,7 @@ def local_metres(degrees: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
     }
 
 
-def overlaid(points: FloatArray, positions: FloatArray) -> Overlay:
+def overlaid(points: FloatArray, positions: FloatArray) -> SimilarityFit:
     """The similarity that aligns points (N, D) with positions (N, D) in metres, D = 2 or 3; half of them may be wrong.
 
     Raises ``InputError`` if there are fewer than ``MIN_POSITIONS``, or if points or positions are all in one place.
@@ -240,7 +240,7 @@ def overlaid(points: FloatArray, positions: FloatArray) -> Overlay:
     off = _off(fit, points, positions)
     variance = float(np.sum(off[near] ** 2)) / max(1, size * int(near.sum()) - unknowns)
     spread = float(np.sum((positions[near] - positions[near].mean(axis=0)) ** 2))
-    return Overlay(float(fit[0]), float(np.sqrt(variance / spread)), off, near)
+    return SimilarityFit(float(fit[0]), float(np.sqrt(variance / spread)), off, near)
 
 
 def _samples(count: int, size: int) -> list[list[int]]:

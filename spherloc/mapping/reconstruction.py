@@ -36,7 +36,7 @@ from spherloc.frontend.features import VERSION, Features, extract
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import camera_centre
-from spherloc.mapping.pairs import MIN_MATCHES, Pairs, relative
+from spherloc.mapping.pairs import MIN_MATCHES, ImagePairs, relative
 from spherloc.mapping.rotations import agreeing
 from spherloc.mapping.triangles import Pair, open_triangles
 from spherloc.mapping.upright import Tell
@@ -149,7 +149,7 @@ def reconstruct(
     try:
         ids = _described(pycolmap, database, views, features, usable)
         cameras = [view.camera for view in views]
-        compared = Pairs(pycolmap, cameras, features, usable, gravity, how.matching)
+        compared = ImagePairs(pycolmap, cameras, features, usable, gravity, how.matching)
         counts, same_place = _matched(database, ids, compared, _pairs(features), tell)
     finally:
         database.close()
@@ -379,7 +379,7 @@ def _camera_in(pycolmap: Any, database: Any, camera: Camera) -> tuple[int, int]:
 
 
 def _matched(
-    database: Any, ids: Sequence[int], compared: Pairs, waiting: Sequence[Pair], tell: Tell
+    database: Any, ids: Sequence[int], compared: ImagePairs, waiting: Sequence[Pair], tell: Tell
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Numbers of matches (V, V) of each pair that fit a relative pose, and the same of pairs taken from one place.
 

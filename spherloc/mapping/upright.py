@@ -47,7 +47,7 @@ class Level:
 
 
 @dataclass(frozen=True)
-class Scale:
+class MapScale:
     """Length of the model's unit."""
 
     metres_per_unit: float
@@ -105,7 +105,7 @@ def _middle(directions: FloatArray) -> FloatArray:
     return middle / np.linalg.norm(middle)
 
 
-def scale_by_distance(poses: Mapping[str, FloatArray], first: str, second: str, metres: float) -> Scale:
+def scale_by_distance(poses: Mapping[str, FloatArray], first: str, second: str, metres: float) -> MapScale:
     """The scale that makes two images of ``poses`` (3, 4) ``metres`` apart.
 
     Raises ``InputError`` if one is not in the map.
@@ -116,10 +116,10 @@ def scale_by_distance(poses: Mapping[str, FloatArray], first: str, second: str, 
     apart = float(np.linalg.norm(camera_centre(poses[first]) - camera_centre(poses[second])))
     if apart == 0.0:
         raise InputError(f"{show(first)} and {show(second)} were taken from one place; name two others.")
-    return Scale(metres / apart, f"{first} and {second} are {metres:g} m apart")
+    return MapScale(metres / apart, f"{first} and {second} are {metres:g} m apart")
 
 
-def scale_by_height(poses: Mapping[str, FloatArray], points: FloatArray, level: Level, metres: float) -> Scale:
+def scale_by_height(poses: Mapping[str, FloatArray], points: FloatArray, level: Level, metres: float) -> MapScale:
     """The scale that puts the cameras ``metres`` above the ground, the deepest of the points (N, 3) below them.
 
     Raises ``InputError`` if there are too few points below the cameras.
@@ -135,10 +135,10 @@ def scale_by_height(poses: Mapping[str, FloatArray], points: FloatArray, level: 
             "between two images with --distance instead."
         )
     height = float(np.quantile(depths, 1.0 - GROUND_SHARE))
-    return Scale(metres / height, f"cameras {metres:g} m above the ground")
+    return MapScale(metres / height, f"cameras {metres:g} m above the ground")
 
 
-def scale_by_positions(poses: Mapping[str, FloatArray], positions: Positions, level: Level) -> Scale:
+def scale_by_positions(poses: Mapping[str, FloatArray], positions: Positions, level: Level) -> MapScale:
     """The scale that aligns the images of ``poses`` (3, 4) with positions from another source.
 
     Raises ``InputError`` if too few have a position, or if these do not fix the scale to ``MAX_SCALE_SD``.
@@ -161,16 +161,16 @@ def scale_by_positions(poses: Mapping[str, FloatArray], positions: Positions, le
             f"{found.scale_sd:.0%}; give --distance or --camera-height."
         )
     source = f"{positions.source}: {measured} in the median, the scale is good to {max(found.scale_sd, 5e-4):.1%}"
-    return Scale(found.scale, source, off_m=off_m)
+    return MapScale(found.scale, source, off_m=off_m)
 
 
-def arbitrary_scale(depths: FloatArray) -> Scale:
+def arbitrary_scale(depths: FloatArray) -> MapScale:
     """The scale at which the median of ``depths`` (N,), distances of points to images that see them, is ten units.
 
     Limits of positions, which are a tenth of a unit, then are a hundredth of that distance, for a rig whose cameras are
     a hand apart as for images along a street.
     """
-    return Scale(MEDIAN_DEPTH / float(np.median(depths)) if len(depths) else 1.0, "")
+    return MapScale(MEDIAN_DEPTH / float(np.median(depths)) if len(depths) else 1.0, "")
 
 
 def upright_frame(level: Level) -> FloatArray:

@@ -15,7 +15,7 @@ from spherloc.frontend.masks import Masks
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.mapping.reconstruction import Reconstruction
-from spherloc.mapping.upright import Level, Scale, upright_frame
+from spherloc.mapping.upright import Level, MapScale, upright_frame
 from spherloc.registry import require
 from spherloc.types import FloatArray
 
@@ -58,7 +58,7 @@ class Kept:
 def write_map(
     made: Reconstruction,
     level: Level,
-    scale: Scale,
+    scale: MapScale,
     views: Sequence[View],
     images: Path,
     folder: Path,
@@ -103,7 +103,7 @@ def cameras_of(views: Sequence[View]) -> dict[str, Camera]:
     return {repr(view.camera): view.camera for view in views}
 
 
-def _about(made: Reconstruction, level: Level, scale: Scale, count: int) -> str:
+def _about(made: Reconstruction, level: Level, scale: MapScale, count: int) -> str:
     units = f"metres: {scale.source}" if scale.source else "unknown, ten are the usual distance of a point to an image"
     return (
         f"Map of {len(made.poses)} of {count} images, {len(made.model.points3D):,} points. "
@@ -111,7 +111,7 @@ def _about(made: Reconstruction, level: Level, scale: Scale, count: int) -> str:
     )
 
 
-def _scene(folder: Path, images: Path, names: Sequence[str], about: str, level: Level, scale: Scale) -> str:
+def _scene(folder: Path, images: Path, names: Sequence[str], about: str, level: Level, scale: MapScale) -> str:
     queries = names[EVERY - 1 :: EVERY] or names[-1:]
     lines = [
         'kind = "colmap"',
@@ -127,7 +127,9 @@ def _scene(folder: Path, images: Path, names: Sequence[str], about: str, level: 
     return "\n".join(lines) + "\n"
 
 
-def _new_scene(folder: Path, images: Path, new_images: Path, view: View, about: str, level: Level, scale: Scale) -> str:
+def _new_scene(
+    folder: Path, images: Path, new_images: Path, view: View, about: str, level: Level, scale: MapScale
+) -> str:
     lines = [
         'kind = "image-folder"',
         f"name = {_text(f'{new_images.name} in {_name(images, scale)}')}",
@@ -146,11 +148,11 @@ def _new_scene(folder: Path, images: Path, new_images: Path, view: View, about: 
     return "\n".join(lines) + "\n"
 
 
-def _name(images: Path, scale: Scale) -> str:
+def _name(images: Path, scale: MapScale) -> str:
     return images.resolve().name + ("" if scale.source else " (units unknown)")
 
 
-def _units(scale: Scale) -> list[str]:
+def _units(scale: MapScale) -> list[str]:
     return [] if scale.source else ['units = "unknown"             # lengths are told in units of the map']
 
 

@@ -20,7 +20,7 @@ from spherloc.metrics import ransac_success_probability
 from spherloc.problem import Problem
 from spherloc.solvers.two_point import two_point
 from spherloc.verification.experiments import CAMERAS, CASES, METHODS, OWN
-from spherloc.verification.measured import Cell, Measured, Place, at, smaller_share
+from spherloc.verification.measured import Cell, Measured, SweepPoint, at, smaller_share
 
 PAPER_RUNS = 100
 """Number of problems at each point of the paper's figures."""
@@ -44,7 +44,7 @@ class Finding:
     """Whether it does."""
     ours: str
     """The measured result, in words and numbers."""
-    decided_by: Place | None = None
+    decided_by: SweepPoint | None = None
     """The point that decides it, if there is one."""
     seed: int = 0
     """Seed of the run at that point that shows it."""

@@ -9,7 +9,7 @@ from spherloc.errors import InputError
 from spherloc.verification.checks import Finding
 from spherloc.verification.claims import CLAIMS, Checked, Verdict
 from spherloc.verification.experiments import METHODS
-from spherloc.verification.measured import Place
+from spherloc.verification.measured import SweepPoint
 
 
 def kept_text(checked: Sequence[Checked]) -> str:
@@ -69,5 +69,5 @@ def _restored_finding(record: Mapping[str, Any] | None) -> Finding | None:
     place = None
     if record["decided_by"] is not None:
         experiment, camera, method, value = record["decided_by"]
-        place = Place(str(experiment), str(camera), str(method), float(value)) if method in METHODS else None
+        place = SweepPoint(str(experiment), str(camera), str(method), float(value)) if method in METHODS else None
     return Finding(bool(record["holds"]), str(record["found"]), place, int(record["seed"]))

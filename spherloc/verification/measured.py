@@ -16,7 +16,7 @@ from spherloc.verification.experiments import METHODS
 
 
 @dataclass(frozen=True)
-class Place:
+class SweepPoint:
     """A point of a sweep."""
 
     experiment: str
@@ -33,7 +33,7 @@ class Place:
 class Cell:
     """The runs of a point. Without a pose an error is infinite, and precision, recall and F1 are 0."""
 
-    place: Place
+    place: SweepPoint
     """The point of the sweep."""
     rows: tuple[SweepRow, ...]
     """Its runs by seed; not empty."""
@@ -86,12 +86,12 @@ class Measured:
     def __init__(self, rows: Mapping[tuple[str, str], Iterable[SweepRow]]) -> None:
         """``rows`` are those of sweeps, by key of the experiment and of the camera."""
         names = {entrant.label: name for name, entrant in METHODS.items()}
-        found: defaultdict[Place, list[SweepRow]] = defaultdict(list)
+        found: defaultdict[SweepPoint, list[SweepRow]] = defaultdict(list)
         for (experiment, camera), some in rows.items():
             for row in some:
                 if row.estimator in names:
-                    found[Place(experiment, camera, names[row.estimator], row.value)].append(row)
-        self.cells: dict[Place, Cell] = {
+                    found[SweepPoint(experiment, camera, names[row.estimator], row.value)].append(row)
+        self.cells: dict[SweepPoint, Cell] = {
             place: Cell(place, tuple(sorted(some, key=lambda row: row.seed))) for place, some in found.items()
         }
         """Cells by place."""
@@ -104,7 +104,7 @@ class Measured:
 
     def cell(self, experiment: str, camera: str, method: str, value: float) -> Cell | None:
         """A cell, if it has runs."""
-        return self.cells.get(Place(experiment, camera, method, value))
+        return self.cells.get(SweepPoint(experiment, camera, method, value))
 
     def methods(self, experiment: str, camera: str) -> tuple[str, ...]:
         """The methods that have runs, in the order of ``METHODS``."""

@@ -16,7 +16,7 @@ MAX_BYTES = 1_000_000
 
 
 @dataclass(frozen=True)
-class Session:
+class DatasetSession:
     """A session of a dataset: query images and references, as a scene file describes them."""
 
     name: str
@@ -35,7 +35,7 @@ class Dataset:
     """Name that users see."""
     methods: tuple[str, ...]
     """Keys of ``TABLE_METHODS``."""
-    sessions: Callable[[Path], Sequence[Session]]
+    sessions: Callable[[Path], Sequence[DatasetSession]]
     """Gives the sessions in a folder that holds the dataset; raises ``InputError`` if there are none."""
 
 
@@ -60,7 +60,7 @@ def iterations(entrant: Entrant) -> str:
     return "1,000" if entrant.estimator.startswith("ransac") else "none"
 
 
-def _kitti360(folder: Path) -> list[Session]:
+def _kitti360(folder: Path) -> list[DatasetSession]:
     """Sequence 5 is the reference, 4 and 6 are the queries (Sec. VI-B.1)."""
     text = """\
 kind = "kitti360"
@@ -77,10 +77,12 @@ thresholds = [[1.0, 0.5], [2.0, 1.0], [5.0, 2.0]]
         for name, query in drives.items()
         if is_folder(folder / "data_2d_raw" / f"2013_05_28_drive_{query:04d}_sync")
     }
-    return [Session(name, text.format(name=name, root=_quoted(folder), query=query)) for name, query in there.items()]
+    return [
+        DatasetSession(name, text.format(name=name, root=_quoted(folder), query=query)) for name, query in there.items()
+    ]
 
 
-def _newer_college(folder: Path) -> list[Session]:
+def _newer_college(folder: Path) -> list[DatasetSession]:
     """The paper names the sessions but not their references: quad-medium and math-easy are used."""
     text = """\
 kind = "newer-college"
@@ -105,12 +107,12 @@ thresholds = [[2.0, 0.25], [5.0, 0.5], [8.0, 1.0]]
     }
     there = {name: reference for name, reference in references.items() if is_folder(folder / name)}
     return [
-        Session(name, text.format(name=name, root=_quoted(folder), reference=reference))
+        DatasetSession(name, text.format(name=name, root=_quoted(folder), reference=reference))
         for name, reference in there.items()
     ]
 
 
-def _matterport360(folder: Path) -> list[Session]:
+def _matterport360(folder: Path) -> list[DatasetSession]:
     """Each building is a session: the paper does not print how it divides 18 buildings into 7 sessions."""
     text = """\
 kind = "matterport360"
@@ -122,7 +124,7 @@ trust_poses = false
 """
     there = sorted(name for name in names_in(folder) if is_folder(folder / name))
     buildings = [name for name in there if any(image.endswith("_rgb.png") for image in names_in(folder / name))]
-    return [Session(name, text.format(name=name, root=_quoted(folder / name))) for name in buildings]
+    return [DatasetSession(name, text.format(name=name, root=_quoted(folder / name))) for name in buildings]
 
 
 def _quoted(path: Path) -> str:
@@ -138,7 +140,7 @@ DATASETS: Sequence[Dataset] = (
 )
 
 
-def sessions_of(dataset: Dataset, folder: Path) -> Sequence[Session]:
+def sessions_of(dataset: Dataset, folder: Path) -> Sequence[DatasetSession]:
     """The sessions of a dataset's folder. Raises ``InputError`` if it is not a folder or holds none."""
     if not is_folder(folder):
         raise InputError(f"{folder}: no such folder; give the folder of {dataset.title}.")

@@ -98,7 +98,7 @@ WHOLE = (0.0, 0.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
+class TexturedMesh:
     """Textured triangles; seen from the front, their corners go anticlockwise."""
 
     vertices: FloatArray
@@ -136,11 +136,11 @@ def xyz(x: float, y: float, z: float) -> FloatArray:
     return np.array([x, y, z], dtype=np.float64)
 
 
-def joined(meshes: Sequence[Mesh]) -> Mesh:
+def joined(meshes: Sequence[TexturedMesh]) -> TexturedMesh:
     """One mesh of several that share an atlas."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     surfaces = np.cumsum([0, *(int(mesh.surface.max(initial=-1)) + 1 for mesh in meshes)])
-    return Mesh(
+    return TexturedMesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
         faces=np.concatenate([m.faces + start for m, start in zip(meshes, starts, strict=False)]).astype(np.int32),
         uv=np.concatenate([mesh.uv for mesh in meshes]),
@@ -157,10 +157,10 @@ class MeshBuilder:
 
     atlas: Atlas
     """Where the tiles are."""
-    parts: list[Mesh] = field(default_factory=list)
+    parts: list[TexturedMesh] = field(default_factory=list)
     """What was added so far."""
 
-    def mesh(self) -> Mesh:
+    def mesh(self) -> TexturedMesh:
         """All of it as one."""
         return joined(self.parts)
 
@@ -273,7 +273,7 @@ class MeshBuilder:
         box = self.atlas.boxes[number].astype(np.float32)
         faces = np.asarray(faces, dtype=np.int32)
         self.parts.append(
-            Mesh(
+            TexturedMesh(
                 vertices=vertices,
                 faces=faces,
                 uv=box[:2] + np.asarray(at, np.float32) * box[2:],
@@ -291,7 +291,7 @@ HEADER_BYTES = 2_000
 FLOAT, USHORT, UINT, UBYTE = 5126, 5123, 5125, 5121
 
 
-def write_glb(mesh: Mesh, atlas: Atlas) -> bytes:
+def write_glb(mesh: TexturedMesh, atlas: Atlas) -> bytes:
     """Vertices as they are (metres, the mesh's own frame), tints as vertex colours, and the atlas as a small JPEG."""
     height, width = atlas.texels.shape[:2]
     vertices = mesh.vertices.astype(np.float32)

@@ -8,7 +8,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from spherloc.types import FloatArray
-from spherloc.worlds.mesh import Mesh
+from spherloc.worlds.mesh import TexturedMesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Hits:
 class RayScene:
     """A mesh that rays are cast into."""
 
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: TexturedMesh) -> None:
         self.mesh = mesh
         self.normals = mesh.normals()
         self.texels_per_metre = mesh.texels_per_metre()

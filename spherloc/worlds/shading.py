@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from spherloc.types import FloatArray
 from spherloc.worlds.conditions import LIGHTS, SNOW, Conditions, Light, recoloured
-from spherloc.worlds.mesh import Mesh
+from spherloc.worlds.mesh import TexturedMesh
 from spherloc.worlds.paint import noise
 from spherloc.worlds.rays import Hits, RayScene
 from spherloc.worlds.world import World
@@ -158,7 +158,7 @@ RAYS = 24
 STRENGTH = 0.6
 
 
-def with_dark_corners(mesh: Mesh, reach_m: float) -> Mesh:
+def with_dark_corners(mesh: TexturedMesh, reach_m: float) -> TexturedMesh:
     """The mesh with its tints darkened by what stands within ``reach_m`` of each vertex."""
     rng = np.random.default_rng(5)
     rays = RayScene(mesh)

@@ -10,7 +10,7 @@ import numpy as np
 from spherloc.errors import InputError
 from spherloc.geometry import pose
 from spherloc.types import FloatArray
-from spherloc.worlds.mesh import Atlas, Mesh, write_glb
+from spherloc.worlds.mesh import Atlas, TexturedMesh, write_glb
 from spherloc.worlds.rays import RayScene
 
 MAX_POSES = 100_000
@@ -32,7 +32,7 @@ class Lane:
 class Surfaces:
     """What a world looks like."""
 
-    mesh: Mesh
+    mesh: TexturedMesh
     """All surfaces."""
     atlas: Atlas
     """Their textures, in summer."""
@@ -67,7 +67,7 @@ class World:
         return self.build()
 
     @property
-    def mesh(self) -> Mesh:
+    def mesh(self) -> TexturedMesh:
         """All surfaces."""
         return self.surfaces.mesh
 

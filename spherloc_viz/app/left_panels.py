@@ -14,7 +14,7 @@ from spherloc_viz.app.introduction import introduction_html
 from spherloc_viz.app.link import TABS
 from spherloc_viz.app.matches.image_panel import ImagePanel
 from spherloc_viz.app.matches.lens_panel import LensPanel
-from spherloc_viz.app.matches.match_table import MatchTable
+from spherloc_viz.app.matches.match_table import MatchTablePanel
 from spherloc_viz.app.plots.charts import ChartPanel
 from spherloc_viz.app.plots.graph_view import GraphView
 from spherloc_viz.app.plots.residual_view import ResidualView
@@ -73,7 +73,7 @@ class LeftPanels:
             self._lens = LensPanel(gui, touches, scene_of, changed)
         with _view(gui, views, "Matches"):
             gui.add_html(heading_html("Press a row: the match lights up everywhere", "match"))
-            self._matches = MatchTable(gui, touches, changed)
+            self._matches = MatchTablePanel(gui, touches, changed)
         self._panel, self._width_px = steps, width_px
         steps.dock_left()
         views.dock_below(steps)

@@ -16,7 +16,7 @@ from spherloc_viz.recording.storage.recorder import Recorder
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class PresentedRun:
     """A run that the presenter has settled on."""
 
     run: Run
@@ -33,11 +33,11 @@ class Presented:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._newest: Shown | None = None
+        self._newest: PresentedRun | None = None
         self._followers: tuple[Callable[[], None], ...] = ()
 
     @property
-    def newest(self) -> Shown | None:
+    def newest(self) -> PresentedRun | None:
         """What is shown now; None before the first run."""
         return self._newest
 
@@ -48,7 +48,7 @@ class Presented:
         with self._lock:
             if self._newest is not None and self._newest.run is run:
                 return
-            self._newest = Shown(run, mesh, diagnosis, withheld)
+            self._newest = PresentedRun(run, mesh, diagnosis, withheld)
         self._tell()
 
     def hide(self, run: Run, withheld: frozenset[str]) -> None:

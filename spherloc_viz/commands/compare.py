@@ -15,8 +15,8 @@ from spherloc.ranges import check_options
 from spherloc.warm_up import warm_up
 from spherloc_viz.app.desk.comparison import (
     QUANTITIES,
-    Comparison,
     Condition,
+    OutcomeChanges,
     Pair,
     compare,
     compare_pairs,
@@ -129,7 +129,7 @@ def _record(store: RecordingStore, trace: Any, origin: Origin) -> RunRow:
     return store.index.get(path.name) or examine(path)
 
 
-def _tell(found: Comparison, before: str, after: str, asked: Wanted) -> int:
+def _tell(found: OutcomeChanges, before: str, after: str, asked: Wanted) -> int:
     """Print a comparison, and write its report; returns 1 if one of the conditions holds."""
     if asked.report is not None:
         _write(asked.report, comparison_html(found, before, after, datetime.now(UTC)))

@@ -34,7 +34,7 @@ from spherloc.frontend.matching import MatchOptions
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
-from spherloc.mapping.make import Map, Measured, make_map
+from spherloc.mapping.make import Map, ScaleMeasurement, make_map
 from spherloc.mapping.pairs import MIN_MATCHES
 from spherloc.mapping.photographs import Photographs, frames_of, photographs
 from spherloc.mapping.positions import read_positions
@@ -55,7 +55,7 @@ def make(
     output: Path | None,
     cameras: Mapping[str, Camera],
     video: tuple[Path, int] | None,
-    measured: Measured,
+    measured: ScaleMeasurement,
     new_images: Path | None,
     *,
     panorama: bool,
@@ -77,7 +77,7 @@ def make(
             _take_frames(*video, folder, tell)
         found = photographs(folder, cameras, masks, panorama)
         if positions is not None:
-            measured = Measured(positions=read_positions(positions, found.views))
+            measured = ScaleMeasurement(positions=read_positions(positions, found.views))
         for remark in found.remarks:
             say(remark)
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
@@ -350,7 +350,7 @@ def main(folder: Path, output: Path) -> int:
     """Make the map of a folder's photographs for a page that started this process; returns the exit code."""
     try:
         found = photographs(folder, {})
-        made = make_map(found.views, folder, output, Measured(), None, _progress)
+        made = make_map(found.views, folder, output, ScaleMeasurement(), None, _progress)
         (output / REPORT).write_text(map_report(made, found), encoding="utf-8")
     except SpherlocError as error:
         _tell({"error": str(error)})

@@ -341,7 +341,7 @@ def map(
         localize: Folder of other images of that camera; a scene is written that localizes them in the map.
     """
     from spherloc.frontend.masks import Masks
-    from spherloc.mapping.make import Measured
+    from spherloc.mapping.make import ScaleMeasurement
     from spherloc_viz.commands.map import cameras_of_file, make
 
     if sum(one is not None for one in (camera_height, distance, positions)) > 1:
@@ -356,7 +356,7 @@ def map(
     taken = None if video is None else (video, frames)
     masked = any(one is not None for one in (mask, nadir, seam))
     masks = Masks(mask, nadir or 0.0, seam or 0.0) if masked else None
-    measured = Measured(camera_height, distance)
+    measured = ScaleMeasurement(camera_height, distance)
     cameras = cameras_of_file(camera, camera_name)
     return make(
         folder,

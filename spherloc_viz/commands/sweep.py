@@ -78,7 +78,7 @@ def _work(
 ) -> None:
     if scheduler is None:
         warm_up(say, {entrant.estimator for entrant in plan.entrants})  # once, before all workers do it
-    recorded = None if store is None else Recorded(store)
+    recorded = None if store is None else SweepRecordings(store)
     keep = None if recorded is None else recorded.keep(scheduler is not None)
     complain = say if recorded is None else recorded.complain
     with progress(left, "runs") as advance:
@@ -91,7 +91,7 @@ def _work(
         recorded.finish()
 
 
-class Recorded:
+class SweepRecordings:
     """The recordings of a sweep, which its workers write: makes room for them, and says once what fails."""
 
     def __init__(self, store: "RecordingStore") -> None:

@@ -20,7 +20,7 @@ from spherloc.verification.sessions import (
     DATASETS,
     TABLE_METHODS,
     Dataset,
-    Session,
+    DatasetSession,
     iterations,
     printed_tables,
     sessions_of,
@@ -196,7 +196,7 @@ def run_sessions(folders: Mapping[str, Path], output: Path, quick: bool) -> list
     return found
 
 
-def _session(dataset: Dataset, session: Session, output: Path, quick: bool) -> list[SessionResult]:
+def _session(dataset: Dataset, session: DatasetSession, output: Path, quick: bool) -> list[SessionResult]:
     folder = output / f"{dataset.key}_{session.name}"
     scene = folder / "scene.toml"
     try:

@@ -25,7 +25,7 @@ from spherloc.verification.experiments import (
     WIDE_SOLVERS,
     WIDE_VIEW,
 )
-from spherloc.verification.measured import Cell, Measured, Place, succeeded
+from spherloc.verification.measured import Cell, Measured, SweepPoint, succeeded
 from spherloc_viz.options import typed
 
 PLAYGROUND = "http://127.0.0.1:8080/"
@@ -120,7 +120,7 @@ def _table(checked: Sequence[Checked]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _places(item: Checked) -> list[tuple[str, Place, int]]:
+def _places(item: Checked) -> list[tuple[str, SweepPoint, int]]:
     """The deciding runs: in which form, where and the seed."""
     forms: list[tuple[str, Finding | None]] = [("as printed", item.printed), ("under the condition", item.other)]
     return [
@@ -142,18 +142,18 @@ def _commands(checked: Sequence[Checked]) -> str:
     return "\n".join([*lines[:-1], "```", ""])
 
 
-def _changes(place: Place) -> list[str]:
+def _changes(place: SweepPoint) -> list[str]:
     """Settings of the simulation at a place, as "KEY=VALUE"."""
     experiment = next(one for one in EXPERIMENTS if one.key == place.experiment)
     value = f"{int(place.value)}" if experiment.over == "correspondences" else f"{place.value:g}"
     return [*settings_of(experiment.plan(place.camera).variation), f"{experiment.over}={value}"]
 
 
-def _options(place: Place) -> list[str]:
+def _options(place: SweepPoint) -> list[str]:
     return [f"{key}={typed(option)}" for key, option in METHODS[place.method].changes]
 
 
-def address(place: Place, seed: int) -> str:
+def address(place: SweepPoint, seed: int) -> str:
     """Address of a run on a playground of this machine."""
     pairs = [("v", "1"), ("scene", load_scene(scene_path(Path(SCENES[place.camera]))).name), ("seed", str(seed))]
     pairs += [("set", text) for text in _changes(place)]
@@ -162,7 +162,7 @@ def address(place: Place, seed: int) -> str:
     return f"{PLAYGROUND}#{urlencode(pairs)}"
 
 
-def command(place: Place, seed: int) -> str:
+def command(place: SweepPoint, seed: int) -> str:
     """Command that does the same run in a terminal."""
     options = f" --option {' '.join(_options(place))}" if METHODS[place.method].changes else ""
     return (

@@ -25,7 +25,7 @@ MIN_PARTNERS = 16
 
 
 @dataclass(frozen=True, eq=False)
-class MatchRows:
+class MatchColumns:
     """The values of the columns for N matches."""
 
     kept: BoolArray
@@ -44,7 +44,7 @@ class MatchRows:
     """(N,) members of the maximum clique: matches, or those of its balls; None if the run looked for no clique."""
 
 
-Filter = Callable[[MatchRows], BoolArray]
+Filter = Callable[[MatchColumns], BoolArray]
 IN_CLIQUE = "in the maximum clique"
 FILTERS: dict[str, Filter] = {
     "all": lambda rows: np.ones(len(rows.kept), dtype=bool),
@@ -57,19 +57,19 @@ FILTERS: dict[str, Filter] = {
 """The filters of the table: which matches are listed, by name."""
 
 
-def offered(rows: MatchRows) -> tuple[str, ...]:
+def offered(rows: MatchColumns) -> tuple[str, ...]:
     """The filters that can be told of these matches."""
     untold = {"wrongly kept", "wrongly rejected"} if rows.right is None else set()
     untold |= {IN_CLIQUE} if rows.clique is None else set()
     return tuple(name for name in FILTERS if name not in untold)
 
 
-def _known(rows: MatchRows) -> NDArray[np.int8]:
+def _known(rows: MatchColumns) -> NDArray[np.int8]:
     """(N,) 1 for true inliers, 0 for true outliers, -1 if the truth is unknown."""
     return np.full(len(rows.kept), -1, np.int8) if rows.right is None else rows.right.astype(np.int8)
 
 
-SORTS: dict[str, Callable[[MatchRows], NDArray]] = {
+SORTS: dict[str, Callable[[MatchColumns], NDArray]] = {
     "number": lambda rows: np.arange(len(rows.kept)),
     "run": lambda rows: ~rows.kept,
     "truth": lambda rows: -_known(rows),
@@ -81,14 +81,14 @@ SORTS: dict[str, Callable[[MatchRows], NDArray]] = {
 
 
 @lru_cache(maxsize=4)
-def match_rows(trace: Trace) -> MatchRows:
+def match_rows(trace: Trace) -> MatchColumns:
     """The matches of a run (cached)."""
     known, count = verdicts(trace), len(trace.problem)
     nothing = np.full(count, np.nan)
     px = nothing if known.estimate is None else known.estimate.px
     deg = nothing if known.estimate is None else np.degrees(known.estimate.rad)
     agree, partners = _agreeing(trace)
-    return MatchRows(known.kept, known.right, px, deg, agree, partners, _in_clique(trace))
+    return MatchColumns(known.kept, known.right, px, deg, agree, partners, _in_clique(trace))
 
 
 def _in_clique(trace: Trace) -> BoolArray | None:
@@ -104,7 +104,7 @@ def _in_clique(trace: Trace) -> BoolArray | None:
     return members
 
 
-def order(rows: MatchRows, shown: str, by: str, down: bool) -> IntArray:
+def order(rows: MatchColumns, shown: str, by: str, down: bool) -> IntArray:
     """Indices of the matches that a filter lists, sorted by a column; unknown values come last in both directions."""
     chosen = np.flatnonzero(FILTERS[shown](rows))
     values = SORTS[by](rows)[chosen].astype(np.float64)

@@ -81,7 +81,7 @@ class Residuals:
 
 
 @dataclass(frozen=True, eq=False)
-class History:
+class BestHistory:
     """The history of RANSAC's best hypothesis, and Eq. 28's prediction."""
 
     drawn: FloatArray
@@ -180,7 +180,7 @@ def scores_table(trace: Trace) -> Table:
     return Table("scores", ("", "matches", ""), rows)
 
 
-def history_of(trace: Trace) -> History | None:
+def history_of(trace: Trace) -> BestHistory | None:
     """The history of a RANSAC run; None for other runs and if no sample gave a pose."""
     stage = trace.stage(RansacStage)
     if stage is None or not len(stage.improved_at):
@@ -190,7 +190,7 @@ def history_of(trace: Trace) -> History | None:
     clean = np.zeros(0, dtype=np.int64) if truth is None else np.flatnonzero(truth[stage.samples].all(axis=1))
     share = float(inliers[-1]) / len(trace.problem)
     at = int(drawn[clean[0]]) if len(clean) else None
-    return History(drawn, inliers, max(1, stage.iterations), share, stage.samples.shape[1], at)
+    return BestHistory(drawn, inliers, max(1, stage.iterations), share, stage.samples.shape[1], at)
 
 
 @dataclass(frozen=True, eq=False)

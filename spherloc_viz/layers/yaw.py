@@ -28,7 +28,7 @@ EXAMPLE_RAD = np.radians(15.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Arcs:
+class StageArcs:
     """A yaw stage and what several of its frames need, computed when it is first asked for. A arcs."""
 
     stage: YawStage
@@ -179,7 +179,7 @@ def pair_roots(view: RunView, first: int, second: int) -> PairRoots:
     return PairRoots(wave, yaws, np.all(depths > 0.0, axis=1))
 
 
-def _pair(view: RunView, arcs: Arcs) -> Frame:
+def _pair(view: RunView, arcs: StageArcs) -> Frame:
     """A pair, and the arc of yaws that it allows."""
     example, stage = arcs.example, arcs.stage
     first, second = (int(number) for number in stage.pairs[example[0]])
@@ -205,7 +205,7 @@ def _pair(view: RunView, arcs: Arcs) -> Frame:
     )
 
 
-def _roots(view: RunView, arcs: Arcs) -> Frame:
+def _roots(view: RunView, arcs: StageArcs) -> Frame:
     """All arcs of the pair, and how many arcs pairs have."""
     example, stage = arcs.example, arcs.stage
     first, second = (int(number) for number in stage.pairs[example[0]])
@@ -249,7 +249,7 @@ def _shown(view: RunView, numbers: tuple[int, int], yaw_rad: float) -> tuple[Flo
     return view.standing(yaw_rotation(yaw_rad)), view.colors(style.UNDECIDED, (mask, style.SAMPLE)), mask
 
 
-def _items(view: RunView, arcs: Arcs, shown: np.ndarray, numbers: tuple[int, int]) -> tuple[SceneItem, ...]:
+def _items(view: RunView, arcs: StageArcs, shown: np.ndarray, numbers: tuple[int, int]) -> tuple[SceneItem, ...]:
     """Some arcs of the pair with a spoke through each, and the line between its points."""
     middles = 0.5 * (arcs.stage.lo_rad + arcs.stage.hi_rad)[shown]
     spokes = [ring.spoke("ring/candidate", view, view.middle, float(yaw), style.SAMPLE).points for yaw in middles]
@@ -277,7 +277,7 @@ REACH = 40
 
 def plans(view: RunView, stage: YawStage) -> list[Plan]:
     """Steps for one pair with its arcs, more and more arcs, candidate yaws, and the largest overlap."""
-    arcs = Arcs(stage)
+    arcs = StageArcs(stage)
     own = {"yaw": lambda: counts_chart(view, arcs.overlap_of(arcs.example).overlap)}
     out = [
         Plan("yaw-pair", "One pair of matches", lambda: _pair(view, arcs)),
@@ -312,7 +312,7 @@ def candidate_yaws(stage: YawStage) -> IntArray:
     return np.sort(highest[np.minimum(gaps, places - gaps) > REACH][:MAX_CANDIDATES])
 
 
-def _some(view: RunView, arcs: Arcs, size: int) -> Frame:
+def _some(view: RunView, arcs: StageArcs, size: int) -> Frame:
     """The first arcs of those that are spread over all pairs."""
     chosen, start = arcs.spread(size), view.standing(np.eye(3))
     found = arcs.overlap_of(chosen)
@@ -334,7 +334,7 @@ def _some(view: RunView, arcs: Arcs, size: int) -> Frame:
     )
 
 
-def _all(view: RunView, arcs: Arcs) -> Frame:
+def _all(view: RunView, arcs: StageArcs) -> Frame:
     stage, start = arcs.stage, view.standing(np.eye(3))
     drawn, count = arcs.spread(style.MAX_DRAWN_ARCS), len(arcs)
     note = stage.rule
@@ -353,7 +353,7 @@ def _all(view: RunView, arcs: Arcs) -> Frame:
     )
 
 
-def _candidate(view: RunView, arcs: Arcs, places: IntArray) -> Frame:
+def _candidate(view: RunView, arcs: StageArcs, places: IntArray) -> Frame:
     """The last of the candidate yaws so far."""
     counts, place = arcs.stage.overlap, int(places[-1])
     lo, hi = (ring.degrees_of(place + part, len(counts)) for part in (0, 1))
@@ -386,7 +386,7 @@ def _so_far(counts: np.ndarray, places: IntArray) -> str:
     return f"The candidate at {where} {'is in more' if most > here else 'is in as many'}: {most:,}."
 
 
-def _clique(view: RunView, arcs: Arcs) -> Frame:
+def _clique(view: RunView, arcs: StageArcs) -> Frame:
     stage, drawn = arcs.stage, arcs.with_clique()
     turned, count = view.standing(yaw_rotation(stage.yaw_rad)), len(arcs)
     note = stage.rule
@@ -415,7 +415,7 @@ def _clique(view: RunView, arcs: Arcs) -> Frame:
 
 def _ring(
     view: RunView,
-    arcs: Arcs,
+    arcs: StageArcs,
     drawn: IntArray,
     counts: np.ndarray,
     marked: np.ndarray | None = None,
@@ -431,7 +431,7 @@ def _ring(
     return band, ring.outline("ring/overlap", line, style.SPHERE), *ring.spokes(view, view.middle, None, yaws_rad)
 
 
-def _growing_chart(view: RunView, arcs: Arcs, size: int) -> Chart:
+def _growing_chart(view: RunView, arcs: StageArcs, size: int) -> Chart:
     return counts_chart(view, arcs.overlap_of(arcs.spread(size)).overlap)
 
 

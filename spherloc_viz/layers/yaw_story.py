@@ -126,7 +126,7 @@ CELLS = 240
 
 
 @dataclass(frozen=True, eq=False)
-class Arcs:
+class PairArcs:
     """A arcs of feasible yaw of pairs of matches, one or more per pair."""
 
     pairs: NDArray[np.integer]
@@ -140,7 +140,7 @@ class Arcs:
 
 
 @dataclass(frozen=True, eq=False)
-class Bars:
+class ArcBars:
     """P pairs, with an arc in a window or selected, and all of their arcs."""
 
     pairs: IntArray
@@ -175,11 +175,11 @@ def right_ones(trace: Trace) -> tuple[NDArray[np.bool_], str]:
     return trace.inlier_mask, "by this run's inliers"
 
 
-def arcs_of(trace: Trace, selected: tuple[int, ...]) -> Arcs:
+def arcs_of(trace: Trace, selected: tuple[int, ...]) -> PairArcs:
     """The run's own arcs; if it stores none, those of some of its inliers, of the selection and of other matches."""
     stage = trace.stage(YawStage)
     if stage is not None:
-        return Arcs(stage.pairs, stage.lo_rad, stage.hi_rad, "")
+        return PairArcs(stage.pairs, stage.lo_rad, stage.hi_rad, "")
     aligned = trace.problem.aligned
     members = _members(trace, selected)
     places = np.searchsorted(aligned.index, members)
@@ -194,7 +194,9 @@ def arcs_of(trace: Trace, selected: tuple[int, ...]) -> Arcs:
     )
     pairs, lo, hi = yaw_arcs(some, bounds.radians[places])
     whole = f"all {len(members)}" if len(members) == len(trace.problem) else f"{len(members)} of {len(trace.problem):,}"
-    return Arcs(members[pairs], lo, hi, f"{trace.estimator} keeps no arcs; these are of the pairs of {whole} matches.")
+    return PairArcs(
+        members[pairs], lo, hi, f"{trace.estimator} keeps no arcs; these are of the pairs of {whole} matches."
+    )
 
 
 def _members(trace: Trace, selected: tuple[int, ...]) -> IntArray:
@@ -216,7 +218,7 @@ def sample(indices: IntArray, count: int) -> IntArray:
     return indices[np.arange(count) * len(indices) // max(1, count)]
 
 
-def peak_window(story: YawStory, arcs: Arcs) -> Window:
+def peak_window(story: YawStory, arcs: PairArcs) -> Window:
     """A window around the estimated yaw, wide enough for most of the arcs over it; the circle without an estimate."""
     if story.estimate_deg is None:
         return ALL
@@ -231,14 +233,14 @@ def peak_window(story: YawStory, arcs: Arcs) -> Window:
     return window_around(step * round(story.estimate_deg / step), width)
 
 
-def _overlapping(arcs: Arcs, low_rad: float, high_rad: float) -> IntArray:
+def _overlapping(arcs: PairArcs, low_rad: float, high_rad: float) -> IntArray:
     """Indices of the arcs that reach into a window from -pi <= low < pi to high <= low + 2 pi."""
     lo, hi, circle = arcs.lo_rad, arcs.hi_rad, 2.0 * np.pi
     inside = ((lo <= high_rad) & (hi >= low_rad)) | (hi >= low_rad + circle) | (lo <= high_rad - circle)
     return np.flatnonzero(inside)
 
 
-def bars_in(trace: Trace, arcs: Arcs, window: Window, selected: tuple[int, ...], most: int = MAX_BARS) -> Bars:
+def bars_in(trace: Trace, arcs: PairArcs, window: Window, selected: tuple[int, ...], most: int = MAX_BARS) -> ArcBars:
     """Selected pairs, wherever their arcs are, and pairs with an arc in a window: an even sample with an equal share of
     each kind.
     """
@@ -264,7 +266,7 @@ def bars_in(trace: Trace, arcs: Arcs, window: Window, selected: tuple[int, ...],
     those = arcs.pairs[first].astype(np.int64)
     lo_deg, hi_deg = np.degrees(arcs.lo_rad[mine]), np.degrees(arcs.hi_rad[mine])
     kinds = 2 - right[those[:, 0]].astype(np.int64) - right[those[:, 1]]
-    return Bars(
+    return ArcBars(
         pairs=those,
         kind=kinds,
         chosen=_chosen(those, selected),

@@ -36,7 +36,7 @@ import itertools
 import time
 from dataclasses import dataclass
 import numpy as np
-from spherloc.estimators.base import Outcome
+from spherloc.estimators.base import Estimate
 from spherloc.refine import RefinementOptions
 
 
@@ -55,7 +55,7 @@ class Patient:
                 clock.watch.reach(min(done, 500))
                 clock.watch.check()
                 time.sleep(0.01)
-        return Outcome((), np.eye(3, 4), np.ones(len(aligned.index), dtype=bool))
+        return Estimate((), np.eye(3, 4), np.ones(len(aligned.index), dtype=bool))
 '''
 CELLS = "rows => rows.map(row => [...row.cells].map(cell => cell.innerText))"
 

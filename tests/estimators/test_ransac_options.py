@@ -12,7 +12,7 @@ from spherloc.consensus import two_point_search
 from spherloc.consensus.inliers import BLOCK, count_inliers, score_inliers
 from spherloc.consensus.two_point_search import sample_pair, search_two_point
 from spherloc.estimators import estimate, options_type
-from spherloc.gauss_newton import Matches
+from spherloc.gauss_newton import AlignedMatches
 from spherloc.geometry import DOWN, pose, yaw_rotation
 from spherloc.metrics import evaluate
 from spherloc.problem import Problem
@@ -74,7 +74,7 @@ def test_scores_are_those_of_the_residuals(scene_of):
     bound_px = bounds_of(aligned, 3.0).pixels
     truth = aligned.align_pose(problem.truth_cam_from_map)
     yaw = np.arctan2(truth[0, 2], truth[0, 0])
-    matches = Matches(aligned.bearings, aligned.points, aligned.pixel_from_bearing)
+    matches = AlignedMatches(aligned.bearings, aligned.points, aligned.pixel_from_bearing)
     for scale in np.repeat([0.0, 0.001, 0.01, 0.1, 3.0], 20):
         angle, t = yaw + scale * rng.normal(), truth[:, 3] + scale * rng.normal(size=3)
         error = residuals_px(aligned, pose(yaw_rotation(angle), t))
@@ -89,7 +89,7 @@ def test_scores_are_those_of_the_residuals(scene_of):
 def test_point_opposite_of_its_bearing_is_no_inlier(scene_of):
     """The early test lets it pass; the score must not."""
     aligned = scene_of("mei", correspondences=20, outlier_rate=0.0, noise_px=0.0).problem().aligned
-    matches = Matches(aligned.bearings, aligned.points, aligned.pixel_from_bearing)
+    matches = AlignedMatches(aligned.bearings, aligned.points, aligned.pixel_from_bearing)
     opposite = -aligned.bearings
     opposite.setflags(write=False)
     flipped, bound_px = matches._replace(bearings=opposite), np.full(20, 8.0)

@@ -18,7 +18,7 @@ from spherloc.frontend.masks import Masks
 from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
-from spherloc.mapping.make import Measured, make_map, scale_of
+from spherloc.mapping.make import ScaleMeasurement, make_map, scale_of
 from spherloc.mapping.photographs import _is_in, frames_of, photographs, two_circles
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
 from spherloc.problem import Problem
@@ -44,7 +44,7 @@ def walk(tmp_path_factory):
     masks = Masks(nadir_deg=12.0)
     found = photographs(folder, {}, masks)
     output = tmp_path_factory.mktemp("map")
-    measured = Measured(distance=(first, second, apart))
+    measured = ScaleMeasurement(distance=(first, second, apart))
 
     def again():
         return make_map(found.views, folder, output, measured, folder, lambda *what: told.append(what), masks)
@@ -111,9 +111,9 @@ def test_a_distance_to_an_image_that_is_not_in_the_map_leaves_the_units_unknown(
     _, _, made, *_ = walk
     name, other = sorted(made.written.poses)[:2]
     less = replace(made.made, poses={key: pose for key, pose in made.made.poses.items() if key != name})
-    scale = scale_of(less, made.level, Measured(distance=(name, other, 5.9)))
+    scale = scale_of(less, made.level, ScaleMeasurement(distance=(name, other, 5.9)))
     assert scale.source == "" and f"'{name}' did not get into the map" in scale.why_unknown
-    assert scale_of(made.made, made.level, Measured(distance=(name, other, 5.9))).metres_per_unit > 0.0
+    assert scale_of(made.made, made.level, ScaleMeasurement(distance=(name, other, 5.9))).metres_per_unit > 0.0
     centres = {number: made.made.model.image(number).projection_center() for number in made.made.model.reg_image_ids()}
     far = np.array([
         [reach([np.linalg.norm(point.xyz - centres[seen.image_id]) for seen in point.track.elements])
@@ -166,7 +166,7 @@ def test_each_image_of_a_rig_has_its_camera(tmp_path, rng):
     )
     assert {view.camera.fx for view in photographs(tmp_path, {"": other}).views} == {95.0}
     with pytest.raises(InputError, match="the photographs have 2; leave --localize out"):
-        make_map(found.views, tmp_path, tmp_path / "map", Measured(), tmp_path, print)
+        make_map(found.views, tmp_path, tmp_path / "map", ScaleMeasurement(), tmp_path, print)
 
     flat = tmp_path / "flat"
     flat.mkdir()
@@ -212,7 +212,7 @@ def rig(walk, tmp_path_factory):
 def test_a_map_of_the_cameras_of_a_rig(rig, tmp_path):
     folder, poses = rig
     found = photographs(folder, {})
-    made = make_map(found.views, folder, tmp_path, Measured(), None, lambda *_: None)
+    made = make_map(found.views, folder, tmp_path, ScaleMeasurement(), None, lambda *_: None)
     names = sorted(made.written.poses)
     assert len(names) >= 8 and len({name.partition("/")[0] for name in names}) == 2
     first = names[0]
@@ -337,9 +337,11 @@ def test_images_that_show_nothing_together(tmp_path, rng):
         picture(tmp_path / name, 400, 200, rng)
     found = photographs(tmp_path, {})
     with pytest.raises(InputError, match=r"'z\.png' is not one of the 2 photographs"):
-        make_map(found.views, tmp_path, tmp_path / "map", Measured(distance=("a.png", "z.png", 1.0)), None, print)
+        make_map(
+            found.views, tmp_path, tmp_path / "map", ScaleMeasurement(distance=("a.png", "z.png", 1.0)), None, print
+        )
     with pytest.raises(InputError, match="no two of the 2 photographs show the same place"):
-        make_map(found.views, tmp_path, tmp_path / "map", Measured(), None, lambda *_: None)
+        make_map(found.views, tmp_path, tmp_path / "map", ScaleMeasurement(), None, lambda *_: None)
 
 
 def test_frames_of_a_video_are_its_sharpest(tmp_path, rng):

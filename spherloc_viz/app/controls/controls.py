@@ -24,9 +24,8 @@ from spherloc_viz.app.controls.sequence_panel import SequencePanel
 from spherloc_viz.app.glossary import heading_html
 from spherloc_viz.app.panels.compare_panel import ComparePanel
 from spherloc_viz.app.panels.export_panel import ExportPanel, Shown
-from spherloc_viz.app.panels.open_panel import Opened as OpenedScene
-from spherloc_viz.app.panels.open_panel import OpenPanel
-from spherloc_viz.app.panels.recordings_panel import Page, RecordingsPanel
+from spherloc_viz.app.panels.open_panel import OpenedScene, OpenPanel
+from spherloc_viz.app.panels.recordings_panel import RecordingsPage, RecordingsPanel
 from spherloc_viz.app.panels.sweep_runs_panel import SweepPanel
 from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.review.reviewer import ReviewCard
@@ -201,7 +200,7 @@ class Controls:
             self._open = OpenPanel(gui, client, touches, services.roots, self._open_scene)
         with tabs.add_tab("Recordings"):
             gui.add_html(heading_html("Recorded runs, and a gallery of failures", "recording"))
-            page = Page(services.roots, self._enter, owner.open, owner.open_recorded, services.downloads)
+            page = RecordingsPage(services.roots, self._enter, owner.open, owner.open_recorded, services.downloads)
             self._recordings = RecordingsPanel(gui, client, touches, services.library, self.review, page)
         with tabs.add_tab("Share"):
             self._export = ExportPanel(gui, client, owner.shown)

@@ -55,7 +55,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class OutcomeChanges:
     """How the outcomes of paired runs changed from one set to the other."""
 
     pairs: tuple[Pair, ...]
@@ -87,7 +87,7 @@ def is_right(row: RunRow) -> bool | None:
     return None if row.doubtful is None else not row.doubtful
 
 
-def compare(before: Sequence[RunRow], after: Sequence[RunRow]) -> Comparison:
+def compare(before: Sequence[RunRow], after: Sequence[RunRow]) -> OutcomeChanges:
     """Pair the runs of two sets, and test what has changed.
 
     Of several runs with the same key the newest one counts. Raises ``InputError`` if no run has a partner.
@@ -102,7 +102,7 @@ def compare(before: Sequence[RunRow], after: Sequence[RunRow]) -> Comparison:
     return compare_pairs(pairs, only_before, only_after)
 
 
-def compare_pairs(pairs: tuple[Pair, ...], only_before: int = 0, only_after: int = 0) -> Comparison:
+def compare_pairs(pairs: tuple[Pair, ...], only_before: int = 0, only_after: int = 0) -> OutcomeChanges:
     """Test what has changed in pairs that are known; the counts are of runs without a partner."""
     from scipy import stats  # takes most of a second
 
@@ -111,7 +111,7 @@ def compare_pairs(pairs: tuple[Pair, ...], only_before: int = 0, only_after: int
     broken = tuple(pair for pair, was, now in known if was and not now)
     mended = tuple(pair for pair, was, now in known if now and not was)
     changed = len(broken) + len(mended)
-    return Comparison(
+    return OutcomeChanges(
         pairs=pairs,
         only_before=only_before,
         only_after=only_after,
@@ -153,7 +153,7 @@ def _change(name: str, pairs: Sequence[Pair]) -> Change:
 
 
 _CONDITION = re.compile(r"\s*([a-z ]+?)\s*(<=|>=|<|>|=)\s*([0-9.]+(?:e-?[0-9]+)?)\s*(%?)\s*")
-QUANTITIES: Mapping[str, Callable[[Comparison], float]] = {
+QUANTITIES: Mapping[str, Callable[[OutcomeChanges], float]] = {
     "new failures": lambda c: len(c.broken),
     "mended": lambda c: len(c.mended),
     "net failures": lambda c: len(c.broken) - len(c.mended),
@@ -182,7 +182,7 @@ class Condition:
     parts: tuple[tuple[str, str, float], ...]
     """Quantity, comparison sign and number of each part."""
 
-    def holds(self, comparison: Comparison) -> bool:
+    def holds(self, comparison: OutcomeChanges) -> bool:
         """Whether it holds for a comparison; false if a quantity is unknown."""
         return all(_COMPARE[sign](QUANTITIES[name](comparison), number) for name, sign, number in self.parts)
 

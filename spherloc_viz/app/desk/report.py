@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from html import escape
 
 from spherloc_viz import style
-from spherloc_viz.app.desk.comparison import Change, Comparison, Pair, causes
+from spherloc_viz.app.desk.comparison import Change, OutcomeChanges, Pair, causes
 from spherloc_viz.app.review import words
 from spherloc_viz.app.review.rows import badge_html, label_html, picture_html
 from spherloc_viz.layers.primitives import true_minus
@@ -116,7 +116,7 @@ TABLE_ROWS = 30
 """Largest number of causes and of scenes that are listed."""
 
 
-def comparison_html(comparison: Comparison, before: str, after: str, now: datetime) -> str:
+def comparison_html(comparison: OutcomeChanges, before: str, after: str, now: datetime) -> str:
     """A page about the changes from the runs called ``before`` to those called ``after``."""
     made = now.astimezone(UTC).strftime("%Y-%m-%d %H:%M UTC")
     broken, mended = len(comparison.broken), len(comparison.mended)
@@ -136,7 +136,7 @@ def comparison_html(comparison: Comparison, before: str, after: str, now: dateti
     return "".join(parts)
 
 
-def comparison_text(comparison: Comparison, before: str, after: str) -> str:
+def comparison_text(comparison: OutcomeChanges, before: str, after: str) -> str:
     """The same as text for a terminal, without pictures."""
     lines = [
         f"{after} against {before}: {_count(len(comparison.pairs), 'pair')} of runs on the same problem",

@@ -15,7 +15,7 @@ from spherloc_viz import style
 from spherloc_viz.app.text import DIM, WITHHELD, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import update_widget
-from spherloc_viz.layers.matches import FILTERS, SORTS, MatchRows, match_rows, offered, order, reference_votes
+from spherloc_viz.layers.matches import FILTERS, SORTS, MatchColumns, match_rows, offered, order, reference_votes
 
 MAX_REFERENCES = 8
 
@@ -65,7 +65,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Look:
+class TableLook:
     """Filter, order and page of the table."""
 
     shown: str = "all"
@@ -74,13 +74,13 @@ class Look:
     page: int = 0
 
 
-class MatchTable:
+class MatchTablePanel:
     """The table of one page."""
 
     def __init__(self, gui: viser.GuiApi, touches: Touches, changed: Callable[[object], None]) -> None:
         self._html = gui.add_html("")
         self._changed = changed
-        self._look = Look()
+        self._look = TableLook()
         self._followed: tuple[int, ...] = ()
         self._drawn: tuple | None = None
         for action, handler in (
@@ -129,7 +129,7 @@ class MatchTable:
         if touch.argument.isdecimal():
             self._show(replace(self._look, page=min(int(touch.argument), 10**6)))
 
-    def _show(self, look: Look) -> None:
+    def _show(self, look: TableLook) -> None:
         self._look = look
         self._changed(look)
 
@@ -142,7 +142,7 @@ def _page_of(listed: IntArray, selected: tuple[int, ...], page: int) -> int:
     return int(places[0]) // PAGE
 
 
-def table_html(rows: MatchRows, listed: IntArray, look: Look, selected: frozenset[int], kept: NDArray) -> str:
+def table_html(rows: MatchColumns, listed: IntArray, look: TableLook, selected: frozenset[int], kept: NDArray) -> str:
     """The current page of the matches ``listed``, with the buttons above and below it."""
     shown = listed[look.page * PAGE : (look.page + 1) * PAGE]
     body = "".join(_row(rows, int(k), int(k) in selected, int(kept[k])) for k in shown)
@@ -153,7 +153,7 @@ def table_html(rows: MatchRows, listed: IntArray, look: Look, selected: frozense
     return box(_filters(rows, look) + table + _pages(rows, listed, look), "font-size:12.5px")
 
 
-def _filters(rows: MatchRows, look: Look) -> str:
+def _filters(rows: MatchColumns, look: TableLook) -> str:
     chips = []
     for name in offered(rows):
         count = np.count_nonzero(FILTERS[name](rows))
@@ -161,7 +161,7 @@ def _filters(rows: MatchRows, look: Look) -> str:
     return "".join(chips)
 
 
-def _headings(look: Look) -> str:
+def _headings(look: TableLook) -> str:
     cells = []
     for place, (name, heading, hint) in enumerate(COLUMNS):
         arrow = "" if name != look.by else " ▾" if look.down else " ▴"
@@ -173,7 +173,7 @@ def _headings(look: Look) -> str:
     return "".join(cells)
 
 
-def _row(rows: MatchRows, k: int, chosen: bool, number: int) -> str:
+def _row(rows: MatchColumns, k: int, chosen: bool, number: int) -> str:
     cell, right = '<td style="padding:.08em .3em">', '<td style="padding:.08em .3em;text-align:right">'
     mark = (
         f"background:{style.css(style.SELECTED)}1c;box-shadow:inset 3px 0 {style.css(style.SELECTED)}" if chosen else ""
@@ -197,7 +197,7 @@ def _number(value: float) -> str:
     return "> 90°" if np.isinf(value) else f"{value:.2f}" if value < 100 else f"{value:,.0f}"
 
 
-def _pages(rows: MatchRows, listed: IntArray, look: Look) -> str:
+def _pages(rows: MatchColumns, listed: IntArray, look: TableLook) -> str:
     first, last = look.page * PAGE + 1, min((look.page + 1) * PAGE, len(listed))
     some = f"{first}–{last} of {len(listed):,}" if len(listed) else "none"
     back = chip("‹", f"match-page:{look.page - 1}", False, "Previous page") if look.page > 0 else ""

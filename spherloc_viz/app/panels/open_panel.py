@@ -15,7 +15,7 @@ from spherloc.errors import InputError
 from spherloc.mapping.photographs import MIN_IMAGES
 from spherloc_viz.app.panels.folders import Listing, Roots, Row, describe
 from spherloc_viz.app.panels.map_panel import OUTPUT, MapPanel
-from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_CALIBRATION_BYTES, File, Form, Scratch, open_upload
+from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_CALIBRATION_BYTES, File, Scratch, UploadForm, open_upload
 from spherloc_viz.app.text import DIM, begun, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import limit_uploads, update_widget
@@ -148,7 +148,7 @@ PASTED = "the pasted calibration"
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
+class OpenedScene:
     """A scene to go to."""
 
     label: str
@@ -167,7 +167,7 @@ class OpenPanel:
         client: viser.ClientHandle,
         touches: Touches,
         roots: Sequence[Path],
-        open_scene: Callable[[Opened], None],
+        open_scene: Callable[[OpenedScene], None],
         recent: RecentScenes | None = None,
     ) -> None:
         """``roots`` are the folders that may be looked into; ``open_scene`` is called on a thread of this panel."""
@@ -245,10 +245,10 @@ class OpenPanel:
             if what not in files:
                 raise InputError(f"{kind} is missing; upload one.")
         in_camera, in_map, bound = (field.value for field in self._gravity)
-        form = Form(files["matches"], files["calibration"], in_camera, in_map, bound, self._truth.value)
+        form = UploadForm(files["matches"], files["calibration"], in_camera, in_map, bound, self._truth.value)
         self._say("Reading the upload …")
         path, scene = open_upload(form, self._scratch.new())
-        self._open_scene(Opened(UPLOADED + form.matches.title, path, scene))
+        self._open_scene(OpenedScene(UPLOADED + form.matches.title, path, scene))
         self._say("")
 
     def _make_map(self, place: str) -> None:
@@ -265,7 +265,7 @@ class OpenPanel:
     def _open_file(self, path: Path) -> None:
         self._say(f"Opening {path.name} …")
         scene = load_scene(path)
-        self._open_scene(Opened(scene.name, path, scene))
+        self._open_scene(OpenedScene(scene.name, path, scene))
         self._recent.note(path)
         self._say("")
         self._refresh()

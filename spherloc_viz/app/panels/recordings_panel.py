@@ -32,7 +32,7 @@ VIEW = "Recordings"
 
 
 @dataclass(frozen=True)
-class Page:
+class RecordingsPage:
     """What the panel asks of its page."""
 
     roots: tuple[Path, ...]
@@ -57,7 +57,7 @@ class RecordingsPanel:
         touches: Touches,
         library: RunLibrary | None,
         card: ReviewCard,
-        page: Page,
+        page: RecordingsPage,
     ) -> None:
         name = str(client.client_id)
         self._library, self._page = library, page

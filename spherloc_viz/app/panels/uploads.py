@@ -45,7 +45,7 @@ class File:
 
 
 @dataclass(frozen=True)
-class Form:
+class UploadForm:
     """What a person filled in."""
 
     matches: File
@@ -93,7 +93,7 @@ class Scratch:
                 shutil.rmtree(self._folder, ignore_errors=True)
 
 
-def open_upload(form: Form, folder: Path) -> tuple[Path, Scene]:
+def open_upload(form: UploadForm, folder: Path) -> tuple[Path, Scene]:
     """Write the scene that a form describes into an empty folder, and read it as any scene file is read.
 
     Raises ``InputError`` in one sentence, which calls the files by the names that they were uploaded with.
@@ -162,7 +162,7 @@ def _toml_keys(content: bytes) -> set[str]:
         return set()
 
 
-def scene_text(form: Form, camera: Camera) -> str:
+def scene_text(form: UploadForm, camera: Camera) -> str:
     """The scene file (TOML) of a form.
 
     Raises ``InputError`` for a field that is not made of as many numbers as it should be.

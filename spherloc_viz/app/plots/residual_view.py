@@ -20,8 +20,8 @@ from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers.primitives import Chart, Curve
 from spherloc_viz.layers.residuals import (
+    BestHistory,
     Histogram,
-    History,
     Residuals,
     bin_words,
     history_of,
@@ -112,7 +112,7 @@ def _bound(histogram: Histogram, x: Scale) -> list[str]:
     return [*parts, shapes.text(min(max(middle, 60.0 + half), WIDTH_PX - half), 11.0, words, "middle")]
 
 
-def history_svg(history: History) -> str:
+def history_svg(history: BestHistory) -> str:
     """Inliers of the best hypothesis over the samples drawn (left axis), and Eq. 28's prediction (right axis)."""
     top, last = 1.08 * float(history.inliers[-1]), float(max(10, history.iterations))
     y, chance = Scale(0.0, top, FOOT_PX, TOP_PX), Scale(0.0, 1.08, FOOT_PX, TOP_PX)
@@ -139,7 +139,7 @@ def history_svg(history: History) -> str:
     return shapes.svg(WIDTH_PX, HEIGHT_PX, [*parts, *_history_legend(history, right_px)], "Inliers over samples drawn")
 
 
-def _history_legend(history: History, right_px: float) -> list[str]:
+def _history_legend(history: BestHistory, right_px: float) -> list[str]:
     parts = [shapes.text(0.0, 11.0, "inliers"), shapes.text(WIDTH_PX, 11.0, "chance", "end")]
     names = [("Eq. 28", style.ESTIMATE), ("best so far", style.INLIER)]
     names += [("clean sample", style.TRUTH)] if history.clean_at is not None else []
@@ -237,13 +237,13 @@ def residuals_caption(residuals: Residuals) -> str:
     return " ".join(words)
 
 
-def _history_html(history: History | None) -> str:
+def _history_html(history: BestHistory | None) -> str:
     if history is None:
         return ""
     return box(_title("How RANSAC got there", "RANSAC") + history_svg(history) + _note(history_caption(history)))
 
 
-def history_caption(history: History) -> str:
+def history_caption(history: BestHistory) -> str:
     """Eq. 28 with this run's numbers, and the first improvement by a clean sample."""
     share = f"w = {100.0 * history.share:.3g} % inliers, n = {history.size}"
     words = f"P = 1 − (1 − wⁿ)ᵏ (Eq. 28) with {share}: "

@@ -24,8 +24,8 @@ from spherloc_viz.layers.yaw import CANDIDATE
 from spherloc_viz.layers.yaw_story import (
     ALL,
     KINDS,
-    Arcs,
-    Bars,
+    ArcBars,
+    PairArcs,
     Window,
     YawStory,
     arcs_of,
@@ -63,7 +63,7 @@ HOVER = (
 """Style rules: while the pointer is on a pair, its arcs over the whole circle are shown too."""
 
 
-def yaw_svg(story: YawStory, bars: Bars, window: Window, kept: NDArray[np.int64], now: str) -> str:
+def yaw_svg(story: YawStory, bars: ArcBars, window: Window, kept: NDArray[np.int64], now: str) -> str:
     """The drawing. ``kept`` (N,) are the numbers of the matches on the page, ``now`` is the key of the current step."""
     top = 1.08 * story.top
     low_px = 9.0 + shapes.text_width_px(tick_texts((story.top,))[0])
@@ -204,7 +204,7 @@ def _hypotheses(story: YawStory, x: Scale, y: Scale, window: Window, now: str) -
     return parts
 
 
-def _bars(bars: Bars, whole: Scale, part: Scale, pitch: float, window: Window, kept: NDArray[np.int64]) -> list[str]:
+def _bars(bars: ArcBars, whole: Scale, part: Scale, pitch: float, window: Window, kept: NDArray[np.int64]) -> list[str]:
     """A bar for each arc in the window; behind it a connection with the other arc of the pair, which is shown when the
     pointer is on the pair or the pair is selected."""
     data, links = _bar_data(bars, whole, part, pitch, window)
@@ -221,7 +221,7 @@ def _bars(bars: Bars, whole: Scale, part: Scale, pitch: float, window: Window, k
     return out
 
 
-def _bar_data(bars: Bars, whole: Scale, part: Scale, pitch: float, window: Window) -> tuple[list[str], list[str]]:
+def _bar_data(bars: ArcBars, whole: Scale, part: Scale, pitch: float, window: Window) -> tuple[list[str], list[str]]:
     """The data of two paths for every pair: its arcs in the window; and, if it has a second arc or is selected, ticks
     at all of its arcs over the whole circle with the lines that connect them, there and in the window."""
     arc, low, high = spans_in(bars.lo_deg, bars.hi_deg, window)
@@ -260,7 +260,7 @@ def _each(template: str, *columns: NDArray[np.floating]) -> list[str]:
     return (f"{template}\n" * len(columns[0]) % tuple(flat)).split("\n")[:-1]
 
 
-def _tips(bars: Bars) -> list[str]:
+def _tips(bars: ArcBars) -> list[str]:
     """The ends of every pair's arcs as text, those in the window first."""
     order = np.lexsort((bars.row < 0, bars.owner))
     texts = _each("%.2f° to %.2f°", bars.lo_deg[order], wrapped_deg(bars.hi_deg[order]))
@@ -272,7 +272,7 @@ def _tips(bars: Bars) -> list[str]:
     return [tip.replace("-", MINUS) for tip in tips]
 
 
-NO_ARCS = Arcs(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0), "")
+NO_ARCS = PairArcs(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0), "")
 UNTOLD = "Answers are hidden: poses that were tried, the estimate, and which arcs are of right matches are told later."
 PEAK, WHOLE = "Zoom to the peak", "All yaws"
 MIN_DRAG = 0.012
@@ -289,7 +289,7 @@ class YawView:
         self._wanted: Window | None = None
         self._peak: Window = ALL
         self._known: tuple[Trace, YawStory] | None = None
-        self._arcs: tuple[Trace, tuple[int, ...], Arcs] | None = None
+        self._arcs: tuple[Trace, tuple[int, ...], PairArcs] | None = None
         self._drawn: tuple | None = None
         self._buttons = gui.add_button_group("Yaw", (PEAK, WHOLE))
         self._html = gui.add_html("")
@@ -341,7 +341,7 @@ class YawView:
             self._known = trace, yaw_story(trace)
         return self._known[1]
 
-    def _arcs_of(self, trace: Trace, selected: tuple[int, ...]) -> Arcs:
+    def _arcs_of(self, trace: Trace, selected: tuple[int, ...]) -> PairArcs:
         if self._arcs is None or self._arcs[0] is not trace or self._arcs[1] != selected:
             self._arcs = trace, selected, arcs_of(trace, selected)
         return self._arcs[2]
@@ -387,7 +387,7 @@ def _window_of(argument: str) -> Window | None:
     return (low, high) if sensible else None
 
 
-def caption(trace: Trace, story: YawStory, arcs: Arcs, bars: Bars) -> str:
+def caption(trace: Trace, story: YawStory, arcs: PairArcs, bars: ArcBars) -> str:
     """The caption: which arcs are shown, by which rule, and the meaning of their colours."""
     total = sum(bars.total)
     if total == 0:

@@ -59,14 +59,14 @@ class Canvas:
         self._full_width = client.camera.image_width
         self._docked_px = docked_px if self._full_width >= NARROW_PX else 0
         self._step: tuple[str, str] | None = None
-        self._followed: views.View | None = None
+        self._followed: views.Viewpoint | None = None
         """The view that showed the subject of the last step that moved the viewer."""
-        self._looked: tuple[str | None, views.View, float] | None = None
+        self._looked: tuple[str | None, views.Viewpoint, float] | None = None
         """The last view that was set: its name, or None for that of the step; the view; and the canvas' aspect
         ratio."""
         self._taken_s = -math.inf
         """When that view was set, seconds of a monotonic clock."""
-        self._held: tuple[str, views.View] | None = None
+        self._held: tuple[str, views.Viewpoint] | None = None
         """The key of a step, and the view that a link asked for at that step."""
         self._held_step_came = False
         """Whether that step has been shown: pictures that were requested before may come first."""
@@ -116,7 +116,7 @@ class Canvas:
         """Keep the view ``viewpoint``, as the method of that name returns it, while this step is shown and the viewer
         is not moved."""
         *numbers, degrees = viewpoint
-        self._held = step_key, views.View(np.array(numbers[:3]), np.array(numbers[3:]), np.radians(degrees))
+        self._held = step_key, views.Viewpoint(np.array(numbers[:3]), np.array(numbers[3:]), np.radians(degrees))
         self._looked, self._held_step_came = None, False
 
     def fill_page(self, pixel_ratio: float) -> None:
@@ -135,7 +135,7 @@ class Canvas:
             return ()
         else:
             camera = self._client.camera
-            view = views.View(np.array(camera.position), np.array(camera.look_at), float(camera.fov))
+            view = views.Viewpoint(np.array(camera.position), np.array(camera.look_at), float(camera.fov))
         degrees = float(np.degrees(view.field_of_view_rad))
         return (*view.position.tolist(), *view.target.tolist(), degrees)
 
@@ -166,7 +166,7 @@ class Canvas:
         away = target - position
         if not (0.0 < angle < np.pi and 0.0 < np.hypot(away[0], away[2]) < np.inf):  # a page may send anything
             return frozenset()
-        return views.cut(picture, views.View(position, target, angle), self._aspect(), self._letter())
+        return views.cut(picture, views.Viewpoint(position, target, angle), self._aspect(), self._letter())
 
     def _letter(self) -> float:
         """Width of a letter in the canvas, as a share of half the canvas' height."""
@@ -225,7 +225,7 @@ class Canvas:
             if not views.fits(name, self._looked[1], picture, aspect):
                 self._look(name, picture)
 
-    def _look_again(self, view: views.View) -> None:
+    def _look_again(self, view: views.Viewpoint) -> None:
         """Set a view that is kept, also again after a page that was still being built has dropped it."""
         if self._looked is None or self._looked[0] != HELD or views.stands_at(self._client, views.START):
             self._take(HELD, view, self._aspect())
@@ -241,7 +241,7 @@ class Canvas:
         )
         self._take(name, wanted, aspect)
 
-    def _take(self, name: str | None, view: views.View, aspect: float) -> None:
+    def _take(self, name: str | None, view: views.Viewpoint, aspect: float) -> None:
         if name is None:
             self._followed = view
         self._looked, self._taken_s = (name, view, aspect), time.monotonic()

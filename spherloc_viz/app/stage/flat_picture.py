@@ -8,7 +8,7 @@ import numpy as np
 from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.app.stage.still_page import Still
-from spherloc_viz.app.stage.views import View, projected
+from spherloc_viz.app.stage.views import Viewpoint, projected
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, SceneItem, Segments
 
 WIDTH, HEIGHT = 560.0, 350.0
@@ -49,7 +49,7 @@ class _Eye:
     """The viewer's pose and the projection into the picture."""
 
     def __init__(self, still: Still) -> None:
-        self.view = View(still.position, still.target, still.field_of_view_rad)
+        self.view = Viewpoint(still.position, still.target, still.field_of_view_rad)
         self._forward = (still.target - still.position) / np.linalg.norm(still.target - still.position)
         self._scale_px = 0.5 * HEIGHT / np.tan(0.5 * still.field_of_view_rad)
 

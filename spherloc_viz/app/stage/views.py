@@ -108,7 +108,7 @@ TURNS_RAD = np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180]
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class Viewpoint:
     """Position, target and field of view of the viewer."""
 
     position: FloatArray
@@ -116,27 +116,27 @@ class View:
     field_of_view_rad: float = FIELD_OF_VIEW_RAD
 
 
-def stands_at(client: viser.ClientHandle, place: View | tuple[float, float, float]) -> bool:
+def stands_at(client: viser.ClientHandle, place: Viewpoint | tuple[float, float, float]) -> bool:
     """Whether the page reports that its viewer is in a view, or at a position; false if its report is not numbers."""
     camera = client.camera
-    if not isinstance(place, View):
+    if not isinstance(place, Viewpoint):
         return bool(np.allclose(camera.position, place))
-    return same(View(np.array(camera.position), np.array(camera.look_at), place.field_of_view_rad), place)
+    return same(Viewpoint(np.array(camera.position), np.array(camera.look_at), place.field_of_view_rad), place)
 
 
-def same(view: View, other: View) -> bool:
+def same(view: Viewpoint, other: Viewpoint) -> bool:
     """Whether two views show the same."""
     near = STILL * float(np.linalg.norm(other.target - other.position))
     places = np.stack([view.position - other.position, view.target - other.target])
     return bool(np.all(np.linalg.norm(places, axis=1) <= near)) and view.field_of_view_rad == other.field_of_view_rad
 
 
-def reach(view: View) -> float:
+def reach(view: Viewpoint) -> float:
     """Distance up to which a page must draw for a view, m: a map of mountains is larger than viser's default."""
     return max(MIN_REACH, REACH * float(np.linalg.norm(view.target - view.position)))
 
 
-def look(client: viser.ClientHandle, view: View) -> None:
+def look(client: viser.ClientHandle, view: Viewpoint) -> None:
     """Move a client's viewer there."""
     with client.atomic():
         camera = client.camera
@@ -147,7 +147,7 @@ def look(client: viser.ClientHandle, view: View) -> None:
         camera.look_at = view.target
 
 
-def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: float = 0.0) -> View:
+def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: float = 0.0) -> Viewpoint:
     """The view of the step's subject, on a canvas with that aspect ratio, between ``walls``. If ``letter``, the width
     of a letter as a share of half the canvas' height, is not 0, the labels beside the subject are in view too."""
     focus = picture.focus
@@ -160,10 +160,10 @@ def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: 
     held = np.vstack([subject, [label.position for label in names]])
     insets = np.vstack([np.zeros((len(subject), 2)), [_half_size(label, letter) for label in names]])
     positions, targets = _fits(held, (view.position - view.target)[None], aspect, insets)
-    return View(positions[0], targets[0])
+    return Viewpoint(positions[0], targets[0])
 
 
-def cut(picture: Picture, view: View, aspect: float, letter: float) -> frozenset[str]:
+def cut(picture: Picture, view: Viewpoint, aspect: float, letter: float) -> frozenset[str]:
     """Names of the labels that the edge of the canvas would cut, or that would cover more important ones."""
     labels = [item for item in picture.scene if isinstance(item, Label)]
     if not labels:
@@ -194,27 +194,27 @@ def _half_size(label: Label, letter: float) -> FloatArray:
     return letter * (len(label.text) * WIDE + HIGH)
 
 
-def around(places: FloatArray, aspect: float) -> View:
+def around(places: FloatArray, aspect: float) -> Viewpoint:
     """An overview of places (K, 3), with room around them."""
     room_m = 0.2 * float(np.max(np.ptp(places, axis=0))) + 1.0
     return _fit(np.vstack([places - room_m, places + room_m]), np.array(DIRECTIONS["Overview"]), aspect)
 
 
-def shows(view: View, subject: FloatArray, aspect: float) -> bool:
+def shows(view: Viewpoint, subject: FloatArray, aspect: float) -> bool:
     """Whether a subject (K, 3) is inside a view and not shown too small."""
     seen = projected(view, subject) / (np.tan(view.field_of_view_rad / 2) * np.array([aspect, 1.0]))
     inside = bool(np.all(np.abs(seen) <= 1.0))
     return inside and float(np.max(np.ptp(seen, axis=0))) / 2 >= MIN_SHARE
 
 
-def fits(name: str | None, view: View, picture: Picture, aspect: float) -> bool:
+def fits(name: str | None, view: Viewpoint, picture: Picture, aspect: float) -> bool:
     """Whether a view of that name, or the step's view for None, still shows its subject."""
     if name is None:
         return shows(view, picture.focus.points, aspect)
     return same(view, _inside(picture)) if name == INSIDE else shows(view, _subject(name, picture), aspect)
 
 
-def projected(view: View, positions: FloatArray) -> FloatArray:
+def projected(view: Viewpoint, positions: FloatArray) -> FloatArray:
     """Projections (K, 2) of positions (K, 3), right and up, as slopes; infinite behind the viewer."""
     backward, right, up = (axes[0] for axes in _axes((view.position - view.target)[None]))
     offset = positions - view.position
@@ -267,7 +267,7 @@ def _apart(camera: Segments, position: FloatArray) -> float:
     return float(np.linalg.norm(camera.points[0, 0] - position))
 
 
-def find(name: str, picture: Picture, aspect: float, walls: Walls | None = None) -> View:
+def find(name: str, picture: Picture, aspect: float, walls: Walls | None = None) -> Viewpoint:
     """The view of that name, fitted to a picture and to a canvas with that aspect ratio.
 
     Close views are turned about the vertical until few ``walls`` and map points are in the way.
@@ -280,7 +280,7 @@ def find(name: str, picture: Picture, aspect: float, walls: Walls | None = None)
 
 def _clear(
     name: str, picture: Picture, subject: FloatArray, clear: FloatArray, aspect: float, walls: Walls | None
-) -> View:
+) -> Viewpoint:
     """A view of a subject (K, 3) from the direction of a named view, turned so that little hides ``clear`` (L, 3)."""
     if name not in ("Sphere", "Balls") and (name != "Overview" or walls is None):
         return _fit(subject, np.array(DIRECTIONS[name]), aspect)
@@ -312,7 +312,7 @@ def _behind(surface: Mesh, positions: FloatArray, targets: FloatArray) -> NDArra
     return np.linalg.norm(share[..., None] * sight - to_centre, axis=2) < _radius_m(surface)
 
 
-def _inside(picture: Picture) -> View:
+def _inside(picture: Picture) -> Viewpoint:
     """The view along the camera's axis from the camera or, while its position is unknown, from the sphere's centre."""
     items = {item.name: item for item in picture.scene}
     surface = _surface(picture)
@@ -322,7 +322,7 @@ def _inside(picture: Picture) -> View:
     camera = items.get("cameras/estimate")
     if isinstance(camera, Segments):
         centre = camera.points[0, 0]
-    return View(centre, centre + TURNING * _radius_m(surface) * axis, WIDE_RAD)
+    return Viewpoint(centre, centre + TURNING * _radius_m(surface) * axis, WIDE_RAD)
 
 
 def _axis(items: dict[str, SceneItem]) -> FloatArray:
@@ -335,10 +335,10 @@ def _axis(items: dict[str, SceneItem]) -> FloatArray:
     return axis / np.linalg.norm(axis)
 
 
-def _fit(subject: FloatArray, direction: FloatArray, aspect: float) -> View:
+def _fit(subject: FloatArray, direction: FloatArray, aspect: float) -> Viewpoint:
     """The nearest view in that direction in which all of the subject (K, 3) is on the canvas."""
     positions, targets = _fits(subject, direction[None], aspect)
-    return View(positions[0], targets[0])
+    return Viewpoint(positions[0], targets[0])
 
 
 def _fits(

@@ -225,7 +225,7 @@ MAX_LAYOUTS = 64
 
 
 @dataclass(frozen=True)
-class Shown:
+class LayoutContent:
     """What a layout has views for. Hashable, so that runs can share layouts."""
 
     charts: tuple[tuple[str, str, bool], ...]
@@ -235,7 +235,7 @@ class Shown:
     panels: Panels
 
 
-def shown_in(pictures: Sequence[Picture], panels: Panels) -> Shown:
+def shown_in(pictures: Sequence[Picture], panels: Panels) -> LayoutContent:
     """What a run shows at any step, in the order of its first appearance."""
     charts: dict[str, Chart] = {}
     for picture in pictures:
@@ -246,7 +246,7 @@ def shown_in(pictures: Sequence[Picture], panels: Panels) -> Shown:
         for name, chart in charts.items()
     )
     tables = tuple(dict.fromkeys(table.name for picture in pictures[:-1] for table in picture.tables))
-    return Shown(named, tables, panels)
+    return LayoutContent(named, tables, panels)
 
 
 def _low_on_the_left(chart: Chart) -> bool:
@@ -258,7 +258,7 @@ def _low_on_the_left(chart: Chart) -> bool:
     return float(y[left].max(initial=0.0)) <= float(y[~left].max(initial=0.0))
 
 
-def blueprint(shown: Shown) -> rrb.Blueprint:
+def blueprint(shown: LayoutContent) -> rrb.Blueprint:
     """The scene above the image, arcs and graph on the left; what the step says, charts and verdict on the right.
 
     The layout pauses on the timeline of steps. A blueprint cannot say at which step: that is decided when the recording
@@ -322,7 +322,7 @@ def _flat_views(panels: Panels) -> list[rrb.View]:
 
 
 @lru_cache(maxsize=MAX_LAYOUTS)
-def layout_file(shown: Shown) -> RrdFile:
+def layout_file(shown: LayoutContent) -> RrdFile:
     """The blueprint as the parts of an ``.rbl`` file.
 
     Kept, since rerun leaves two threads behind for every blueprint that it saves.
