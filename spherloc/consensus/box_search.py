@@ -97,8 +97,8 @@ def _yaw_of_turn(turn):
 def _in_window(scratch, kept, count, start, end, out):
     """Write those of ``count`` matches in ``kept`` (K,) whose interval meets a window of turns to ``out`` (K,).
 
-    The intervals are those of ``scratch``, a ``StabbingMemory``; the window goes from ``start`` to ``end``, turns. Returns how
-    many.
+    The intervals are those of ``scratch``, a ``StabbingMemory``; the window goes from ``start`` to ``end``, turns.
+    Returns how many.
     """
     used = 0
     for k in range(count):

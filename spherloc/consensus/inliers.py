@@ -33,9 +33,9 @@ def count_inliers(yaw, translation, matches, bound_px):
 def score_inliers(yaw, translation, matches, bound_px, mask):
     """Fill ``mask`` (M,) with what ``count_inliers`` counts; return how many, and the MSAC support.
 
-    The pose is level: ``yaw``, rad, and ``translation`` (3,), m. ``matches`` are ``AlignedMatches``, ``bound_px`` (M,) their
-    bounds. The support is the sum of 1 - (error / bound)^2 over the inliers, so that M - support is the MSAC cost in
-    units of the squared bound (Torr and Zisserman, "MLESAC", 2000).
+    The pose is level: ``yaw``, rad, and ``translation`` (3,), m. ``matches`` are ``AlignedMatches``, ``bound_px`` (M,)
+    their bounds. The support is the sum of 1 - (error / bound)^2 over the inliers, so that M - support is the MSAC cost
+    in units of the squared bound (Torr and Zisserman, "MLESAC", 2000).
     """
     bearings, points, jacobian = matches.bearings, matches.points, matches.pixel_jacobian
     c, s = np.cos(yaw), np.sin(yaw)

@@ -362,9 +362,9 @@ def search_poses(matches, cell_of, members, room, limits, found, board):
     """Split a cell until no part may explain more than the best pose and ``limits.gap``.
 
     The cell is ``cell_of`` = (chart, lower (6,), upper (6,)); ``members`` (K,) are all of ``matches``,
-    ``PackedMatches``, that may be explained in it. ``room`` is a ``SearchMemory``, ``limits`` are ``Limits``. ``found`` is
-    (best_at, state, left): better poses go to ``best_at`` (7,), chart and parameters, and to ``state``; where the
-    effort ends, cells go to ``left``. A watch's ``board`` can end it too.
+    ``PackedMatches``, that may be explained in it. ``room`` is a ``SearchMemory``, ``limits`` are ``Limits``.
+    ``found`` is (best_at, state, left): better poses go to ``best_at`` (7,), chart and parameters, and to ``state``;
+    where the effort ends, cells go to ``left``. A watch's ``board`` can end it too.
     """
     chart, lower, upper = cell_of
     best_at, state, left = found

@@ -25,8 +25,8 @@ WINDOW_MARGIN = 1e-12
 def prove_cells(matches, chart, ends, claim, switch_rad, memory, cells, board):
     """Write final cells of a ``chart``, ``ends`` = (lower (6,), upper (6,)), that together hold it, to ``cells``.
 
-    ``matches`` are ``PackedMatches``; ``switch_rad`` is as in ``Limits``. ``memory`` is (StabbingMemory, yaw bound (B,) that
-    excludes nothing); ``cells`` is (lower (K, 6), upper (K, 6), about (K, 2): rule and bound, at most ``claim``).
+    ``matches`` are ``PackedMatches``; ``switch_rad`` is as in ``Limits``. ``memory`` is (StabbingMemory, yaw bound (B,)
+    that excludes nothing); ``cells`` is (lower (K, 6), upper (K, 6), about (K, 2): rule and bound, at most ``claim``).
     Returns how many; -1 if there is no room for all or a watch's ``board`` ends it, -2 if some cell cannot be bounded
     by ``claim``.
     """

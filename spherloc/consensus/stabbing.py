@@ -230,8 +230,8 @@ def _bin(turn, bins):
 def _count(scratch, count, free):
     """Count the ends of ``count`` intervals by bin, ``free`` of them being the whole circle.
 
-    They are those of ``scratch``, a ``StabbingMemory``. Returns how many bins there are, and the depth at the end of the
-    circle.
+    They are those of ``scratch``, a ``StabbingMemory``. Returns how many bins there are, and the depth at the end of
+    the circle.
     """
     starts, ends, opened, closed, before = scratch.starts, scratch.ends, scratch.opened, scratch.closed, scratch.before
     bins = MANY_BINS if count >= MANY else FEW_BINS
@@ -253,8 +253,8 @@ def _count(scratch, count, free):
 def _sort_ends(scratch, count, bins, cutoff):
     """Sort the ends of ``count`` intervals in deep ``bins``, those that more than ``cutoff`` intervals touch.
 
-    All are in ``scratch``, a ``StabbingMemory``: ``opened`` and ``closed`` become where those of each end in ``opening`` and
-    ``closing``; -1 of other bins, where the depth does not exceed ``cutoff``.
+    All are in ``scratch``, a ``StabbingMemory``: ``opened`` and ``closed`` become where those of each end in
+    ``opening`` and ``closing``; -1 of other bins, where the depth does not exceed ``cutoff``.
     """
     starts, ends, opened, closed, before = scratch.starts, scratch.ends, scratch.opened, scratch.closed, scratch.before
     opening, closing = scratch.opening, scratch.closing
