@@ -19,7 +19,7 @@ tests=(
 
 brief=(
   tests/cameras/test_camera_round_trip.py tests/test_reopen.py tests/test_repeat.py tests/test_recording_round_trip.py
-  tests/test_run_list.py tests/test_recording_strangers.py
+  tests/test_run_list.py tests/test_recording_untrusted.py
 )
 packages=('.[test]') words=() missing=1
 if [ "${1:-}" = --brief ]; then

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, settings
 from spherloc.datasets import load_scene
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.sandbox import examiner as strangers
+from spherloc_viz.recording.sandbox import examiner as examiners
 from spherloc_viz.recording.sandbox.examiner import Examiner
 from tests.needs import lacking, real_data
 
@@ -115,7 +115,7 @@ def rng(request: pytest.FixtureRequest) -> np.random.Generator:
 def own_examiner() -> Iterator[None]:
     """What the tests of a file have examined, a process of their own reads, which ends with them."""
     with pytest.MonkeyPatch.context() as patch, Examiner() as examiner:
-        patch.setattr(strangers, "_shared", examiner)
+        patch.setattr(examiners, "_shared", examiner)
         yield
 
 

@@ -181,7 +181,7 @@ def evil_row() -> RunRow:
     return made_row(1, **texts | {"labels": (EVIL,), "query": EVIL, "options": json.dumps({EVIL: EVIL})})
 
 
-def test_texts_of_strangers_are_no_html() -> None:
+def test_untrusted_texts_are_no_html() -> None:
     row = evil_row()
     counts = Counts(1, ((EVIL, 1),), ((EVIL, 1),), 0, ((EVIL, 1),))
     pages = (

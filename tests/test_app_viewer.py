@@ -233,7 +233,7 @@ def test_labels_that_cannot_be_shown_are_told(folder: Folder, run: str, words: s
     visit(*folder, calls)
 
 
-def test_strangers_are_refused_here_too(folder: Folder) -> None:
+def test_other_sites_are_refused_here_too(folder: Folder) -> None:
     async def calls(door: Door) -> None:
         for path in ("viewer/?run=good.rrd", "viewer/data/good.rrd", f"viewer/program/{viewer_version()}/re_viewer.js"):
             assert (await door.get(path, Host="rebound.example")).status == 403

@@ -386,10 +386,10 @@ def test_nobody_else_may_ask(recorded: Path) -> None:
 
     visit(recorded, calls)
 
-    async def strangers(door: Door) -> None:
+    async def untrusted(door: Door) -> None:
         assert (await door.get("desk")).status == 403 and (await do(door, view)).status == 403
 
-    visit(recorded, strangers, token=True)
+    visit(recorded, untrusted, token=True)
 
     async def without() -> None:
         async with door_to(1) as door:

@@ -15,7 +15,7 @@ import pytest
 
 from spherloc.errors import RecordingError
 from spherloc_viz.recording.index.run_index import RunIndex, examine_side_by_side
-from spherloc_viz.recording.sandbox import examiner as strangers
+from spherloc_viz.recording.sandbox import examiner as examiners
 from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError
 from spherloc_viz.recording.storage.recorder import Recorder
 from tests.waiting import LIMIT_S, until
@@ -76,7 +76,7 @@ class Stuck:
 def stuck(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stuck:
     stuck = Stuck(tmp_path)
     monkeypatch.setattr(sys, "executable", str(stuck.program))
-    monkeypatch.setattr(strangers, "FILE_LIMIT_S", 3600.0)
+    monkeypatch.setattr(examiners, "FILE_LIMIT_S", 3600.0)
     return stuck
 
 

@@ -285,7 +285,7 @@ def hostile_row() -> RunRow:
 
 
 @pytest.mark.parametrize("form", ("table", "json", "csv"))
-def test_strings_of_strangers_cannot_act(form: str):
+def test_untrusted_strings_cannot_act(form: str):
     """No control character, no formula, one line a row."""
     text = rows_text(Path("recordings"), [hostile_row(), some_row("b.rrd", options='{"a": NaN, "b": 1e999}')], form)
     assert "\x1b" not in text and "\u202e" not in text

@@ -173,7 +173,7 @@ def test_gravity_is_off_by_no_more_than_is_said(tmp_path):
     assert 0.6 * bound < max(tilts) <= bound * 1.0001
 
 
-def test_queries_and_references_have_their_own_strangers(tmp_path):
+def test_queries_and_references_have_their_own_occluders(tmp_path):
     scene = scene_of(tmp_path, SMALL.replace("stop = 0.52", "stop = 0.52\noccluders = 3"))
     assert len({view.path for view in (*scene.queries, *scene.references)}) == 6
 

@@ -42,7 +42,7 @@ from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.reviews import Review, review_path, write_review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox import checks
-from spherloc_viz.recording.sandbox import examiner as strangers
+from spherloc_viz.recording.sandbox import examiner as examiners
 from spherloc_viz.recording.sandbox.child import FILE_LIMIT_BYTES
 from spherloc_viz.recording.sandbox.examiner import Examiner, examine, examine_all
 from tests.needs import needs
@@ -297,7 +297,7 @@ def test_a_huge_recording_fills_no_memory(good: Path, tmp_path: Path, examiner: 
 def test_a_child_that_hangs_or_has_ended_is_replaced(
     good: Path, examiner: Examiner, monkeypatch: pytest.MonkeyPatch, sign: signal.Signals
 ) -> None:
-    monkeypatch.setattr(strangers, "BEGIN_LIMIT_S", 0.5)
+    monkeypatch.setattr(examiners, "BEGIN_LIMIT_S", 0.5)
     row = examiner.examine(good)
     before = examiner._child
     assert before is not None
@@ -336,7 +336,7 @@ def test_many_threads_may_examine(good: Path, examiner: Examiner) -> None:
 def test_one_file_is_examined_by_a_child_that_stays(
     good: Path, examiner: Examiner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(strangers, "_shared", examiner)
+    monkeypatch.setattr(examiners, "_shared", examiner)
     row, child = examine(good), examiner._child
     assert examine(good) == row and child is not None
     assert examiner._child is child and child._process.poll() is None
