@@ -154,6 +154,7 @@ arcs_strategy = st.lists(st.tuples(st.floats(-180, 179.99), st.floats(0, 360)), 
 @given(arcs_strategy, st.floats(-180, 179.99), st.floats(0.05, 360))
 @example([(0.0, 360.0)], 0.0, 1.0)
 @example([(0.0, 360.0), (10.0, 5.0)], -1.0, 360.0)
+@example([(162.3434644592084, 0.0)], 0.0, 162.3434644592084)  # in radians and back it is outside
 def test_bars_of_a_row_never_touch(arcs: list[tuple[float, float]], low: float, width: float) -> None:
     window = (low, low + width)
     lo, span = np.array(arcs).T

@@ -121,6 +121,8 @@ MAX_CHOSEN = 24
 MAX_MATCHES, MAX_INLIERS = 32, 20
 """For a run that stores no arcs: number of matches whose pairs are computed, and of inliers among them."""
 KINDS = ("both right", "one wrong", "both wrong")
+ROUNDING_RAD = 1e-9
+"""More than what is lost between radians and degrees."""
 CELLS = 240
 """Number of cells across the window by which bars are packed into rows."""
 
@@ -233,10 +235,19 @@ def peak_window(story: YawStory, arcs: PairArcs) -> Window:
     return window_around(step * round(story.estimate_deg / step), width)
 
 
-def _overlapping(arcs: PairArcs, low_rad: float, high_rad: float) -> IntArray:
-    """Indices of the arcs that reach into a window from -pi <= low < pi to high <= low + 2 pi."""
+def _overlapping(arcs: PairArcs, low_rad: float, high_rad: float) -> NDArray[np.bool_]:
+    """Mask of the arcs that reach into a window from -pi <= low < pi to high <= low + 2 pi."""
     lo, hi, circle = arcs.lo_rad, arcs.hi_rad, 2.0 * np.pi
-    inside = ((lo <= high_rad) & (hi >= low_rad)) | (hi >= low_rad + circle) | (lo <= high_rad - circle)
+    return ((lo <= high_rad) & (hi >= low_rad)) | (hi >= low_rad + circle) | (lo <= high_rad - circle)
+
+
+def _in_window(arcs: PairArcs, window: Window) -> IntArray:
+    """Indices of the arcs of which ``spans_in`` finds a part: only those that just touch the window need its degrees."""
+    low, high = np.radians(window).tolist()
+    inside = _overlapping(arcs, low + ROUNDING_RAD, high - ROUNDING_RAD)
+    touching = np.flatnonzero(_overlapping(arcs, low - ROUNDING_RAD, high + ROUNDING_RAD) & ~inside)
+    found, _, _ = spans_in(np.degrees(arcs.lo_rad[touching]), np.degrees(arcs.hi_rad[touching]), window)
+    inside[touching[found]] = True
     return np.flatnonzero(inside)
 
 
@@ -245,7 +256,7 @@ def bars_in(trace: Trace, arcs: PairArcs, window: Window, selected: tuple[int, .
     each kind.
     """
     right, _ = right_ones(trace)
-    inside = _overlapping(arcs, *np.radians(window).tolist())
+    inside = _in_window(arcs, window)
     pairs = arcs.pairs[inside]
     kind = 2 - right[pairs[:, 0]].astype(np.int64) - right[pairs[:, 1]]
     of_kind = [inside[kind == k] for k in range(len(KINDS))]
