@@ -242,7 +242,7 @@ def _overlapping(arcs: PairArcs, low_rad: float, high_rad: float) -> NDArray[np.
 
 
 def _in_window(arcs: PairArcs, window: Window) -> IntArray:
-    """Indices of the arcs of which ``spans_in`` finds a part: only those that just touch the window need its degrees."""
+    """Indices of the arcs of which ``spans_in`` finds a part; only where one just touches the window is it asked."""
     low, high = np.radians(window).tolist()
     inside = _overlapping(arcs, low + ROUNDING_RAD, high - ROUNDING_RAD)
     touching = np.flatnonzero(_overlapping(arcs, low - ROUNDING_RAD, high + ROUNDING_RAD) & ~inside)
