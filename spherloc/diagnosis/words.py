@@ -97,7 +97,7 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
     run, best, second = (0 if fit is None else fit.support(bound) for fit in (e.run, e.best, other))
     match cause:
         case Cause.OK:
-            return f"{run} of {total} matches agree within {_px(bound)}, {_compared(e, truth, run)}."
+            return f"{run} of {total} matches agree within {px_text(bound)}, {_compared(e, truth, run)}."
         case Cause.TOO_FEW_INLIERS if truth is not None:
             return f"Only {np.count_nonzero(truth.right)} of {total} matches are right, no more than chance gives."
         case Cause.TOO_FEW_INLIERS:
@@ -124,8 +124,8 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
 def _narrow_summary(e: Evidence, narrow: Narrow) -> str:
     best = 0 if e.best is None else e.best.support(e.bound_px)
     return (
-        f"Within {_px(e.bound_px)} no pose explains more matches than chance gives (the best {best} of "
-        f"{len(e.aligned.points)}); within {_px(narrow.bound_px)} one that {narrow.fit.support(narrow.bound_px)} "
+        f"Within {px_text(e.bound_px)} no pose explains more matches than chance gives (the best {best} of "
+        f"{len(e.aligned.points)}); within {px_text(narrow.bound_px)} one that {narrow.fit.support(narrow.bound_px)} "
         "agree with stands out."
     )
 
@@ -163,8 +163,8 @@ def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause, unit: str)
     one, two = (int(np.count_nonzero(errors <= factor * e.bound_px)) for factor in (1, 2))
     where = "" if truth is None else "at the true pose, " if fit is truth.exact else "near the true pose, "
     return (
-        f"The noise exceeds the bound: {where}{one} matches are within its {_px(e.bound_px)}, {two} within twice as "
-        "much."
+        f"The noise exceeds the bound: {where}{one} matches are within its {px_text(e.bound_px)}, {two} within twice "
+        "as much."
     )
 
 
@@ -174,7 +174,7 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
         yield "The run has no pose."
     else:
         support, counted = e.run.support(bound), int(np.count_nonzero(trace.inlier_mask))
-        yield f"{support} of {total} matches agree with the run's pose within {_px(bound)}."
+        yield f"{support} of {total} matches agree with the run's pose within {px_text(bound)}."
         if counted != support:
             yield f"The run counts {counted}, within a bound that allows for the error of gravity too."
     if e.best is not None:
@@ -230,8 +230,9 @@ def _deg(angle_rad: float) -> str:
     return f"{np.degrees(angle_rad):.2g}°" if angle_rad < 1.7 else f"{np.degrees(angle_rad):.0f}°"
 
 
-def _px(size_px: float) -> str:
-    return f"{size_px:.3g} px" if size_px < 1000 else f"{size_px:.0f} px"
+def px_text(size_px: float) -> str:
+    """A length in pixels as text with three digits, or all of a large one."""
+    return f"{size_px:.3g} px" if size_px < 1000 else f"{size_px:,.0f} px"
 
 
 def _distance(distance: float, unit: str) -> str:

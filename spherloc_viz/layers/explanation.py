@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from spherloc.diagnosis.words import px_text
 from spherloc.geometry import yaw_of
 from spherloc.metrics import evaluate, rotation_error_deg, translation_error_m
 from spherloc.trace import ConsensusStage, RansacStage, Trace, TranslationStage, YawStage
@@ -48,7 +49,8 @@ def reason(trace: Trace, poses: Poses) -> tuple[str, str]:
         return "Not judged", _joined("The run found no pose to judge it by.", _by_truth(poses))
     if poses.kept:
         verdict = "Kept" + rightly[poses.right]
-        first = f"At the estimated pose it is {_px(poses.estimate[0])} off, within its bound of {_px(poses.bound_px)}."
+        off, bound = px_text(poses.estimate[0]), px_text(poses.bound_px)
+        first = f"At the estimated pose it is {off} off, within its bound of {bound}."
         return verdict, _joined(first, _why_kept(trace, poses))
     verdict = "Rejected" + rightly[None if poses.right is None else not poses.right]
     return verdict, _joined(_how_far(poses, poses.estimate), _why_rejected(trace, poses), poses.lost)
@@ -64,8 +66,8 @@ def _how_far(poses: Poses, residual: tuple[float, float]) -> str:
         return f"At the estimated pose its point is {degrees:.0f}° from the direction of its pixel."
     times = px / poses.bound_px
     if times < NEARLY:
-        return f"At the estimated pose it is {_px(px)} off, just beyond its bound of {_px(poses.bound_px)}."
-    return f"At the estimated pose it is {_px(px)} off, {times:,.0f} times its bound of {_px(poses.bound_px)}."
+        return f"At the estimated pose it is {px_text(px)} off, just beyond its bound of {px_text(poses.bound_px)}."
+    return f"At the estimated pose it is {px_text(px)} off, {times:,.0f} times its bound of {px_text(poses.bound_px)}."
 
 
 def _why_kept(trace: Trace, poses: Poses) -> str:
@@ -79,7 +81,7 @@ def _why_kept(trace: Trace, poses: Poses) -> str:
     if poses.truth is None:
         return "But its label says that it is wrong."
     if poses.truth[0] <= poses.bound_px:
-        return f"Its label says that it is wrong, though it is {_px(poses.truth[0])} off at the true pose."
+        return f"Its label says that it is wrong, though it is {px_text(poses.truth[0])} off at the true pose."
     if evaluate(trace).success:
         return f"At the true pose it is {_off(poses.truth)}: an outlier that fits by chance."
     off = _off(poses.truth)
@@ -134,7 +136,7 @@ def _by_pairs(poses: Poses) -> str:
 
 def _off(residual: tuple[float, float]) -> str:
     px, degrees = residual
-    return f"{degrees:.0f}° off" if np.isinf(px) else f"{_px(px)} off"
+    return f"{degrees:.0f}° off" if np.isinf(px) else f"{px_text(px)} off"
 
 
 def _away(trace: Trace) -> str:
@@ -144,11 +146,6 @@ def _away(trace: Trace) -> str:
 
 def _between(one: FloatArray, other: FloatArray, unit: str) -> str:
     return f"{translation_error_m(one, other):.2f} {unit} and {rotation_error_deg(one, other):.1f}°"
-
-
-def _px(value: float) -> str:
-    """A length in pixels as text with three digits."""
-    return f"{value:.3g} px" if value < 1000 else f"{value:,.0f} px"
 
 
 WORST = 3

@@ -8,6 +8,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from spherloc.diagnosis.words import px_text
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
@@ -277,4 +278,4 @@ def _excluding(number: int, pairs: Pairs, kept: NDArray) -> str:
 
 
 def _px(value: float) -> str:
-    return "over 90°" if np.isinf(value) else f"{value:.3g} px" if value < 1000 else f"{value:,.0f} px"
+    return "over 90°" if np.isinf(value) else px_text(value)
