@@ -23,7 +23,7 @@ from spherloc.cameras.extensions import Reader, reader_of
 from spherloc.datasets.scene_file import SceneKind, load_scene, loader_of, read_table, scene_kind
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.errors import CalibrationError, InputError, ProblemError, show
-from spherloc.estimators.base import Clock, Estimate, estimator_of, outcome_faults, run_estimator
+from spherloc.estimators.base import Clock, Estimate, estimate_faults, estimator_of, run_estimator
 from spherloc.files import read_file
 from spherloc.geometry import pose, so3_exp
 from spherloc.metrics import evaluate, rotation_error_deg, translation_error_m
@@ -443,7 +443,7 @@ class _Impatient(Watch):
 
 
 class _CheckedEstimator:
-    """An estimator whose outcomes are checked."""
+    """An estimator whose results are checked."""
 
     def __init__(self, estimator: Any, subject: Subject) -> None:
         self._estimator, self._say = estimator, subject
@@ -470,13 +470,13 @@ class _CheckedEstimator:
         return run_estimator(self, "checked", problem, None, seed, watch)
 
     def run(self, aligned: AlignedProblem, options: Any, bounds: Bounds, seed: int, clock: Clock) -> Estimate:
-        outcome, subject = self._estimator.run(aligned, options, bounds, seed, clock), self._say
-        faults = outcome_faults(outcome, len(aligned.index))
+        result, subject = self._estimator.run(aligned, options, bounds, seed, clock), self._say
+        faults = estimate_faults(result, len(aligned.index))
         subject.need(not faults, f"returns {' and '.join(faults)} of a wrong form")
-        if outcome.cam_from_map is None:
-            subject.need(outcome.reason.endswith("."), "gives no pose and no reason, which is a sentence")
-            subject.need(not outcome.inlier_mask.any(), "has inliers without a pose")
+        if result.cam_from_map is None:
+            subject.need(result.reason.endswith("."), "gives no pose and no reason, which is a sentence")
+            subject.need(not result.inlier_mask.any(), "has inliers without a pose")
         else:
-            subject.need(not outcome.reason, f"has a pose and the reason {show(outcome.reason)} why there is none")
-            _check_rotations(np.asarray(outcome.cam_from_map)[None], subject, "of its result")
-        return outcome
+            subject.need(not result.reason, f"has a pose and the reason {show(result.reason)} why there is none")
+            _check_rotations(np.asarray(result.cam_from_map)[None], subject, "of its result")
+        return result

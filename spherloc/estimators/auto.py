@@ -77,7 +77,7 @@ class Auto:
                 return _without_gravity(aligned, wrong, decision, options)
         shared = {item.name: getattr(options, item.name) for item in fields(options)}
         if decision.chosen == "mc-exact":
-            outcome = ExactMaximumConsensus.run(aligned, McExactOptions(**shared), bounds, seed, clock)
+            result = ExactMaximumConsensus.run(aligned, McExactOptions(**shared), bounds, seed, clock)
         else:
             sampling = RansacOptions(
                 **shared,
@@ -86,16 +86,16 @@ class Auto:
                 scoring="msac",
                 local_optimization=True,
             )
-            outcome = TwoPointRansac.run(aligned, sampling, bounds, seed, clock)
-        if not early and (wrong := _gravity_fault(aligned, outcome.cam_from_map, outcome.inlier_mask, options, clock)):
+            result = TwoPointRansac.run(aligned, sampling, bounds, seed, clock)
+        if not early and (wrong := _gravity_fault(aligned, result.cam_from_map, result.inlier_mask, options, clock)):
             return _without_gravity(aligned, wrong, decision, options)
         return Estimate(
-            (decision, *outcome.stages),
-            outcome.cam_from_map,
-            outcome.inlier_mask,
-            outcome.reason,
-            outcome.note,
-            outcome.certificate,
+            (decision, *result.stages),
+            result.cam_from_map,
+            result.inlier_mask,
+            result.reason,
+            result.note,
+            result.certificate,
         )
 
 
@@ -133,7 +133,7 @@ def _gravity_fault(
 def _without_gravity(
     aligned: AlignedProblem, wrong: Contradiction, decision: DecisionStage, options: AutoOptions
 ) -> Estimate:
-    """The outcome where gravity is beyond its bound: the pose that shows it, refined without gravity."""
+    """The estimate where gravity is beyond its bound: the pose that shows it, refined without gravity."""
     more = f": {wrong.support} different matches agree without it, {wrong.believed_support} with it"
     note = (
         f"Gravity is off by {np.degrees(wrong.tilt_rad):.2g}°, beyond its bound of "

@@ -149,13 +149,13 @@ def check_switches(options: Any) -> None:
             raise InputError(f"option {item.name} is {show(value)}; give true or false.")
 
 
-def outcome_faults(outcome: Any, count: int) -> list[str]:
-    """What of an outcome has a form that cannot become a trace of ``count`` usable matches, in words."""
-    pose = outcome.cam_from_map
+def estimate_faults(result: Any, count: int) -> list[str]:
+    """What of an estimator's result has a form that cannot become a trace of ``count`` usable matches, in words."""
+    pose = result.cam_from_map
     good = {
-        "stages": all(isinstance(stage, Stage) and isinstance(stage.kind, str) for stage in outcome.stages),
+        "stages": all(isinstance(stage, Stage) and isinstance(stage.kind, str) for stage in result.stages),
         "a pose": pose is None or (np.shape(pose) == (3, 4) and bool(np.isfinite(pose).all())),
-        "an inlier mask": np.shape(outcome.inlier_mask) == (count,) and np.asarray(outcome.inlier_mask).dtype == bool,
+        "an inlier mask": np.shape(result.inlier_mask) == (count,) and np.asarray(result.inlier_mask).dtype == bool,
     }
     return [what for what, fits in good.items() if not fits]
 
@@ -195,17 +195,17 @@ def run_estimator(
     try:
         clock.watch.check()
         with registry.guarded("estimators", estimator):
-            outcome = kind.run(aligned, options, bounds, seed, clock)
+            result = kind.run(aligned, options, bounds, seed, clock)
             is_extension = bool(registry.extension_of("estimators", estimator))
-            if is_extension and (faults := outcome_faults(outcome, len(aligned.index))):
+            if is_extension and (faults := estimate_faults(result, len(aligned.index))):
                 what = f"{registry.title('estimators', estimator)} returned {' and '.join(faults)}"
                 raise InputError(f"{what} of a wrong form; tell its authors.")
         clock.watch.finish()
     except Cancelled as cancelled:
         raise cancelled.with_traceback(None) from None  # whose frames would keep the gigabytes of the run alive
     clock.timings_ms["total"] = (time.perf_counter() - start) * 1e3
-    pose = None if outcome.cam_from_map is None else aligned.unalign_pose(outcome.cam_from_map)
-    mask = aligned.full_mask(outcome.inlier_mask)
+    pose = None if result.cam_from_map is None else aligned.unalign_pose(result.cam_from_map)
+    mask = aligned.full_mask(result.inlier_mask)
     found = f"Pose found: {np.count_nonzero(mask)} of {len(problem)} correspondences agree with it."
     return Trace(
         problem=problem,
@@ -213,10 +213,10 @@ def run_estimator(
         options=options,
         seed=seed,
         versions=versions(),
-        stages=outcome.stages,
+        stages=result.stages,
         timings_ms=clock.timings_ms,
         cam_from_map=pose,
         inlier_mask=mask,
-        message=outcome.reason or " ".join(filter(None, (found, outcome.note))),
-        certificate=outcome.certificate,
+        message=result.reason or " ".join(filter(None, (found, result.note))),
+        certificate=result.certificate,
     )
