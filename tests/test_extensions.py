@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from spherloc.registry import KINDS, RANSAC
+from spherloc.warm_up import warm_up
 from tests.installed import install, python, spherloc_each
 
 SCENE = """
@@ -374,6 +375,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def done(place: Path) -> list[subprocess.CompletedProcess[str]]:
     """All commands, in one process."""
+    warm_up()  # they tell of compiling
     run = ["run", "tiny.toml", "--no-record", "--estimator"]
     wanted = [
         ["scenes"],
