@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from spherloc.geometry import yaw_rotation
 from spherloc.types import FloatArray
+from spherloc_viz.app.web.viser_internals import place_viewer
 from spherloc_viz.layers.frame import RING_ROOM, SPHERE_ROOM, circle, dense_points, sphere_box
 from spherloc_viz.layers.primitives import Label, Mesh, Picture, Points, SceneItem, Segments, Textured
 
@@ -105,6 +106,8 @@ CLOSE = 0.15
 """Distance from a camera's centre, in sphere radii, within which the viewer counts as inside the camera."""
 TURNS_RAD = np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])
 """Rotations of a view about the vertical that are tried, the smallest first."""
+YAW_TURNS = np.array([yaw_rotation(turn).T for turn in TURNS_RAD])
+"""The same as matrices (T, 3, 3) that turn rows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +146,7 @@ def look(client: viser.ClientHandle, view: Viewpoint) -> None:
         camera.up_direction = UP
         camera.fov = view.field_of_view_rad
         camera.far = reach(view)
-        camera.position = view.position
-        camera.look_at = view.target
+        place_viewer(client, view.position, view.target)
 
 
 def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: float = 0.0) -> Viewpoint:
@@ -158,7 +160,7 @@ def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: 
     if not names:
         return view
     held = np.vstack([subject, [label.position for label in names]])
-    insets = np.vstack([np.zeros((len(subject), 2)), [_half_size(label, letter) for label in names]])
+    insets = np.vstack([np.zeros((len(subject), 2)), _half_sizes(names, letter)])
     positions, targets = _fits(held, (view.position - view.target)[None], aspect, insets)
     return Viewpoint(positions[0], targets[0])
 
@@ -170,12 +172,12 @@ def cut(picture: Picture, view: Viewpoint, aspect: float, letter: float) -> froz
         return frozenset()
     labels.sort(key=lambda label: label.layer in BESIDE)
     seen = projected(view, np.array([label.position for label in labels])) / np.tan(view.field_of_view_rad / 2)
-    halves = np.array([_half_size(label, letter) for label in labels])
+    halves = _half_sizes(labels, letter)
+    within = (np.abs(seen) + halves <= np.array([aspect, 1.0]) + ROUNDING).all(axis=1)
     shown: list[int] = []
-    for k in range(len(labels)):
-        inside = np.all(np.abs(seen[k]) + halves[k] <= np.array([aspect, 1.0]) + ROUNDING)
-        covers = np.all(np.abs(seen[k] - seen[shown]) < halves[k] + halves[shown], axis=1)
-        if inside and not (labels[k].layer in BESIDE and covers.any()):
+    for k in np.flatnonzero(within).tolist():
+        beside = labels[k].layer in BESIDE
+        if not (beside and (np.abs(seen[k] - seen[shown]) < halves[k] + halves[shown]).all(axis=1).any()):
             shown.append(k)
     return frozenset(label.name for k, label in enumerate(labels) if k not in shown)
 
@@ -189,9 +191,9 @@ def _names(picture: Picture, subject: FloatArray) -> list[Label]:
     return [label for label in own if np.all((label.position > low - room) & (label.position < high + room))]
 
 
-def _half_size(label: Label, letter: float) -> FloatArray:
-    """Half the width and height (2,) of a label, in the unit of ``letter``."""
-    return letter * (len(label.text) * WIDE + HIGH)
+def _half_sizes(labels: list[Label], letter: float) -> FloatArray:
+    """Half the width and height (L, 2) of labels, in the unit of ``letter``."""
+    return letter * (np.array([[len(label.text)] for label in labels]) * WIDE + HIGH)
 
 
 def around(places: FloatArray, aspect: float) -> Viewpoint:
@@ -216,7 +218,7 @@ def fits(name: str | None, view: Viewpoint, picture: Picture, aspect: float) -> 
 
 def projected(view: Viewpoint, positions: FloatArray) -> FloatArray:
     """Projections (K, 2) of positions (K, 3), right and up, as slopes; infinite behind the viewer."""
-    backward, right, up = (axes[0] for axes in _axes((view.position - view.target)[None]))
+    backward, right, up = _axes((view.position - view.target)[None])[:, 0]
     offset = positions - view.position
     depth = -(offset @ backward)
     slopes = np.full((len(positions), 2), np.inf)
@@ -231,7 +233,7 @@ def before_the_eyes(picture: Picture, position: FloatArray) -> frozenset[str]:
     surface = _surface(picture)
     if surface is None:
         return frozenset()
-    close_m = CLOSE * _radius_m(surface)
+    close_m = CLOSE * _ball(surface)[1]
     cameras = [item for item in picture.scene if isinstance(item, Segments) and item.layer == "cameras"]
     names = {item.name for item in cameras if len(item.points) and _apart(item, position) < close_m}
     if "cameras/estimate" in names:
@@ -247,10 +249,11 @@ def inside(picture: Picture, position: FloatArray) -> bool:
     if surface is None:
         return False
     camera = next((item for item in picture.scene if item.name == "cameras/estimate"), None)
-    apart_m = [float(np.linalg.norm(_centre(surface) - position))]
+    centre, radius_m = _ball(surface)
+    apart_m = [float(np.linalg.norm(centre - position))]
     if isinstance(camera, Segments) and len(camera.points):
         apart_m.append(_apart(camera, position))
-    return min(apart_m) < CLOSE * _radius_m(surface)
+    return min(apart_m) < CLOSE * radius_m
 
 
 def _surface(picture: Picture) -> Mesh | None:
@@ -258,8 +261,11 @@ def _surface(picture: Picture) -> Mesh | None:
     return next((item for item in picture.scene if isinstance(item, Mesh) and item.name == "sphere/surface"), None)
 
 
-def _radius_m(surface: Mesh) -> float:
-    return float(np.max(surface.vertices[:, 0] - _centre(surface)[0]))
+@lru_cache(maxsize=8)
+def _ball(surface: Mesh) -> tuple[FloatArray, float]:
+    """Centre (3,) and radius, m, of the sphere."""
+    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+    return (low + high) / 2, float(high[0] - low[0]) / 2
 
 
 def _apart(camera: Segments, position: FloatArray) -> float:
@@ -285,16 +291,19 @@ def _clear(
     if name not in ("Sphere", "Balls") and (name != "Overview" or walls is None):
         return _fit(subject, np.array(DIRECTIONS[name]), aspect)
     sides = [DIRECTIONS[name]] if walls is None else [DIRECTIONS[name], STEEP]
-    directions = np.array([yaw_rotation(turn) @ np.array(side) for side in sides for turn in TURNS_RAD])
+    directions = (np.array(sides)[:, None, None] @ YAW_TURNS).reshape(-1, 3)
     points = next(item for item in picture.scene if isinstance(item, Points) and item.name == "map/points")
-    hidden = _in_the_way(*_fits(clear, directions, aspect), points.positions) + 0.5 * np.arange(len(directions))
-    positions, looked_at = _fits(subject, directions, aspect)[0], _sample(subject)
-    if walls is not None:
-        hidden += len(points.positions) * np.array([walls.blocked(position, looked_at) for position in positions])
-    surface = _surface(picture)
-    if name == "Balls" and surface is not None:
-        hidden += len(points.positions) * np.mean(_behind(surface, positions, looked_at), axis=1)
-    return _fit(subject, directions[int(np.argmin(hidden))], aspect)
+    positions, targets = _fits(subject, directions, aspect)
+    fitted = (positions, targets) if clear is subject else _fits(clear, directions, aspect)
+    hidden = _in_the_way(*fitted, points.positions) + 0.5 * np.arange(len(directions))
+    if walls is not None or name == "Balls":
+        looked_at, surface = _sample(subject), _surface(picture)
+        if walls is not None:
+            hidden += len(points.positions) * np.array([walls.blocked(position, looked_at) for position in positions])
+        if name == "Balls" and surface is not None:
+            hidden += len(points.positions) * np.mean(_behind(surface, positions, looked_at), axis=1)
+    best = int(np.argmin(hidden))
+    return Viewpoint(positions[best], targets[best])
 
 
 def _sample(subject: FloatArray) -> FloatArray:
@@ -307,9 +316,10 @@ def _sample(subject: FloatArray) -> FloatArray:
 def _behind(surface: Mesh, positions: FloatArray, targets: FloatArray) -> NDArray[np.bool_]:
     """Whether the sphere hides targets (K, 3) from positions (D, 3), as (D, K)."""
     sight = targets - positions[:, None]
-    to_centre = (_centre(surface) - positions)[:, None]
+    centre, radius_m = _ball(surface)
+    to_centre = (centre - positions)[:, None]
     share = np.clip(np.sum(to_centre * sight, axis=2) / np.sum(sight**2, axis=2), 0.0, 1.0)
-    return np.linalg.norm(share[..., None] * sight - to_centre, axis=2) < _radius_m(surface)
+    return np.linalg.norm(share[..., None] * sight - to_centre, axis=2) < radius_m
 
 
 def _inside(picture: Picture) -> Viewpoint:
@@ -317,12 +327,12 @@ def _inside(picture: Picture) -> Viewpoint:
     items = {item.name: item for item in picture.scene}
     surface = _surface(picture)
     assert surface is not None
-    centre = _centre(surface)
+    centre, radius_m = _ball(surface)
     axis = _axis(items)
     camera = items.get("cameras/estimate")
     if isinstance(camera, Segments):
         centre = camera.points[0, 0]
-    return Viewpoint(centre, centre + TURNING * _radius_m(surface) * axis, WIDE_RAD)
+    return Viewpoint(centre, centre + TURNING * radius_m * axis, WIDE_RAD)
 
 
 def _axis(items: dict[str, SceneItem]) -> FloatArray:
@@ -349,41 +359,42 @@ def _fits(
     ``insets`` (K, 2) are least distances of the points from the edge, as shares of half the canvas' height, where they
     are larger than the margins.
     """
-    backward, right, up = _axes(directions)
+    axes = _axes(directions)
     edges = np.array([aspect, 1.0])
     free = np.broadcast_to(MARGINS * edges, (len(subject), 2))
     if insets is not None:  # some room is left on a canvas that is narrower than its words
         free = np.clip(insets, free, 0.9 * edges)
-    slopes = np.tan(FIELD_OF_VIEW_RAD / 2) * (edges - free).T
-    middle = (np.min(subject, axis=0) + np.max(subject, axis=0)) / 2
-    offset = subject - middle
-    # Of the subject (D, K), and of the target (D, 1), which moves: towards the viewer, to the right and up.
-    parts = [axes @ offset.T for axes in (backward, right, up)]
-    target = [np.zeros((len(directions), 1)) for _ in parts]
+    slopes = (np.tan(FIELD_OF_VIEW_RAD / 2) * (edges - free)).T[:, None]
+    room = slopes.max(axis=2, keepdims=True) - slopes
+    middle = (subject.min(axis=0) + subject.max(axis=0)) / 2
+    # Of the subject (D, K) and (2, D, K), and of the target (2, D, 1), which moves: towards the viewer, and to the
+    # right and up.
+    depth, *sides = axes @ (subject - middle).T
+    across, target = np.array(sides), np.zeros((2, len(directions), 1))
 
     def least_distance() -> FloatArray:
         """Least distances (D, 1) from which the subject is within the slopes."""
-        depth, *across = (part - place for part, place in zip(parts, target, strict=True))
-        needed = [np.abs(one) / slope + depth for one, slope in zip(across, slopes, strict=True)]
-        return np.maximum(1e-3, np.maximum(*needed).max(axis=1, keepdims=True))
+        needed = np.abs(across - target) / slopes
+        return np.maximum(1e-3, (needed.max(axis=0) + depth).max(axis=1, keepdims=True))
 
     for _ in range(ROUNDS):
         distance = least_distance()
-        away = np.maximum(distance - parts[0] + target[0], 1e-3)
-        for side in (1, 2):
-            seen, room = (parts[side] - target[side]) / away, slopes[side - 1].max() - slopes[side - 1]
-            low, high = np.min(seen - room, axis=1), np.max(seen + room, axis=1)
-            target[side] = target[side] + distance * (low + high)[:, None] / 2
-    targets = middle + sum(place * axes for place, axes in zip(target, (backward, right, up), strict=True))
-    return targets + least_distance() * backward, targets
+        seen = (across - target) / np.maximum(distance - depth, 1e-3)
+        low, high = (seen - room).min(axis=2, keepdims=True), (seen + room).max(axis=2, keepdims=True)
+        target += distance * (low + high) / 2
+    targets = middle + (target * axes[1:]).sum(axis=0)
+    return targets + least_distance() * axes[0], targets
 
 
-def _axes(directions: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Unit vectors (D, 3) towards viewers in those directions (D, 3), and to each viewer's right and up."""
-    backward = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    right = np.cross(UP, backward)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    return backward, right, np.cross(backward, right)
+def _axes(directions: FloatArray) -> FloatArray:
+    """Unit vectors (3, D, 3) towards viewers in those directions (D, 3), and to each viewer's right and up."""
+    backward = directions / np.sqrt((directions**2).sum(axis=1, keepdims=True))
+    x, y, z = backward.T
+    level = np.hypot(x, z)  # up is -y
+    zero = np.zeros_like(x)
+    right = np.array([-z, zero, x]) / level
+    up = np.array([-x * y, level**2, -y * z]) / level
+    return np.array([backward, right.T, -up.T])
 
 
 def _in_the_way(standing: FloatArray, targets: FloatArray, positions: FloatArray) -> FloatArray:
@@ -418,10 +429,5 @@ def _subject(name: str, picture: Picture) -> FloatArray:
 def _sphere(surface: object, ring: bool) -> FloatArray:
     """The sphere with some room, or the ring around it."""
     assert isinstance(surface, Mesh)
-    centre = _centre(surface)
-    radius_m = float(np.max(surface.vertices[:, 0] - centre[0]))
+    centre, radius_m = _ball(surface)
     return circle(centre, RING_ROOM * radius_m) if ring else sphere_box(centre, SPHERE_ROOM * radius_m)
-
-
-def _centre(surface: Mesh) -> FloatArray:
-    return (np.min(surface.vertices, axis=0) + np.max(surface.vertices, axis=0)) / 2
