@@ -58,7 +58,7 @@ def test_what_is_written_is_read_again(place: Place) -> None:
     options = replace(default_options("ransac-2p", place.catalog.problem(scene)), iterations=77, confidence=0.97)
     viewpoint = (1.5, -2.25, 3.0, 0.0, 0.125, -1e-05, 45.0)
     request = RunRequest(scene, "ransac-2p", options)
-    view = PageView("sample-3", (2, 4), "light", answers_hidden=True, viewpoint=viewpoint, tab="Graph")
+    view = PageView("sample-3", (2, 4), "light", True, viewpoint, "Graph", compared=("mc", "ransac-2p"))
     found = place.follower.follow(place.link(request, view), place.now, VIEW)
     assert (found.request, found.view, found.remarks) == (request, view, ())
     assert place.follower.follow("", place.now, VIEW).remarks == ()
@@ -104,6 +104,7 @@ def test_a_scene_of_an_allowed_folder_is_opened_again(place: Place) -> None:
         ("view", "1,2,3,0,0,0,999", "view is"),
         ("theme", "pink", "theme is 'pink'; give dark or light."),
         ("tab", "Play", "tab is 'Play'; give Yaw, Graph, "),
+        ("compare", "mc,magic,mc", "the estimator 'magic' is unknown, so it is not compared."),
     ],
 )
 def test_what_is_wrong_is_a_remark_and_the_rest_is_opened(place: Place, key: str, value: str, remark: str) -> None:
@@ -117,6 +118,7 @@ def test_what_is_wrong_is_a_remark_and_the_rest_is_opened(place: Place, key: str
     assert found.request.estimator == ("mc" if key == "estimator" else "ransac-2p")
     if key != "seed":
         assert found.request.scene.seed == 8
+    assert found.view.compared == (("mc",) if key == "compare" else ())
     place.catalog.problem(found.request.scene)
 
 

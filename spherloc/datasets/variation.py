@@ -184,7 +184,7 @@ def _changed_name(scene: SyntheticScene, changed: SyntheticScene, fields_changed
         "outlier_kind": f"{changed.outlier_kind} outliers",
         "field_of_view_deg": f"{changed.field_of_view_deg:g}° wide",
         "cloud_height_m": f"{changed.cloud_height_m:g} m high",
-        "gravity_error_deg": f"gravity off by {changed.gravity_error_deg:g}°",
+        "gravity_error_deg": f"gravity error {changed.gravity_error_deg:g}° (1 sd)",
         "true_camera": "camera moved",
     }
     told = [words[field] for field in words if field in fields_changed and words[field] not in name]

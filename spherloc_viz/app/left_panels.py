@@ -53,7 +53,7 @@ class LeftPanels:
             self._introduction, self._front, self._ready = gui.add_html(""), gui.add_html(""), gui.add_html("")
             gui.add_html(glossary_html())
             self._card = gui.add_html("")
-        self._opening = self._of_step = self._asked = ""
+        self._opening = self._of_step = self._asked = self._elsewhere = ""
         self.tab = TABS[0]
         """The view that a person or a link has brought to the front, for the page's link."""
         self._seen, self._changed = frozenset({"Yaw"}), changed
@@ -119,17 +119,19 @@ class LeftPanels:
         elif self._opening:
             summary, ending = opening_html(self._opening), f'<div style="opacity:.35">{ending}</div>'
         self._of_step = front_of(picture.step.stage, picture.step.key) or self._of_step
-        front = front_html(self._of_step, self._asked)
+        front = front_html(self._of_step, self._asked, self._elsewhere)
         for widget, html in ((self._front, front), (self._summary, summary), (self._outcome, ending)):
             update_widget(widget, content=html)
         if not self._introduction.content:
             self._introduction.content = introduction_html(steps(run.trace))
 
-    def open_tab(self, tab: str) -> None:
-        """Bring a view to the front, once: then it is the person's to choose."""
+    def open_tab(self, tab: str, elsewhere: str = "") -> None:
+        """Bring a view to the front, and a tab of another panel, once: then it is the person's to choose."""
         self.tab = tab
         if tab != TABS[0]:
-            self._asked = f"{tab} {1 + int(self._asked.partition(' ')[2] or 0)}"
+            self._asked = _once_more(tab, self._asked)
+        if elsewhere:
+            self._elsewhere = _once_more(elsewhere, self._elsewhere)
 
     def begin_opening(self, label: str) -> None:
         """Until a run of this scene is shown, say that the panels still show the scene before."""
@@ -190,9 +192,14 @@ def front_of(stage: str, key: str) -> str:
     return "Graph" if key.startswith("consensus-clique") else FRONTS.get(stage, "")
 
 
-def front_html(name: str, asked: str) -> str:
-    """Tells the page's script which view goes with a step, and what tab a link asked for."""
-    return f'<div hidden data-front="{name}" data-tab="{asked}"></div>'
+def front_html(name: str, asked: str, elsewhere: str) -> str:
+    """Tells the page's script which view goes with a step, and what tabs a link asked for, here and elsewhere."""
+    return f'<div hidden data-front="{name}" data-tab="{asked}" data-elsewhere="{elsewhere}"></div>'
+
+
+def _once_more(tab: str, asked: str) -> str:
+    """The words that ask for a tab, "NAME NUMBER", after those that ``asked`` before."""
+    return f"{tab} {1 + int(asked.partition(' ')[2] or 0)}"
 
 
 @contextmanager

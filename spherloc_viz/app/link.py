@@ -35,12 +35,12 @@ TABS = ("step's", "Yaw", "Graph", "Charts", "Residuals", "Images", "Matches")
 """The tabs of the lower left panel, after the word for the one that goes with the step."""
 SCENE_KEYS = ("scene", "case", "place")
 MAX_NAMED = 5
-"""Most matches that one remark names."""
+"""Most matches or estimators that one remark names."""
 LISTS = ("spoil", "mend", "hide")
 """Keys of ``EDITS``, in their order."""
 ONCE = (
     *("v", "run", "scene", "case", "place", "seed", "query", "camera", *LISTS, "estimator"),
-    *("step", "select", "view", "theme", "answers", "tab"),
+    *("step", "select", "view", "theme", "answers", "tab", "compare"),
 )
 MANY = ("set", "option")
 
@@ -58,6 +58,8 @@ class PageView:
     viewpoint: tuple[float, ...] = ()
     """The viewer's position (3), target (3), and field of view, degrees; empty for the step's own view."""
     tab: str = TABS[0]
+    compared: tuple[str, ...] = ()
+    """Names of the estimators that are compared on the run's problem."""
 
 
 def link_of(
@@ -92,6 +94,7 @@ def link_of(
         ("tab", view.tab if view.tab != TABS[0] else None),
         ("theme", view.theme if view.theme != THEMES[0] else None),
         ("answers", ANSWERS[1] if view.answers_hidden else None),
+        ("compare", ",".join(view.compared)),
     ]
     text = urlencode([(key, value) for key, value in pairs if value])
     return text if len(text) <= MAX_LETTERS else ""
@@ -292,7 +295,17 @@ def _view(said: dict[str, Any], view: PageView, opened: Opened | None, remarks: 
     except InputError as error:
         remarks.append(str(error))
     step = said.get("step", view.step if opened is None else "")
-    return PageView(step, selected, theme, hidden, viewpoint, _one_of(said, "tab", TABS, remarks))
+    tab = _one_of(said, "tab", TABS, remarks)
+    return PageView(step, selected, theme, hidden, viewpoint, tab, _compared(said.get("compare", ""), remarks))
+
+
+def _compared(text: str, remarks: list[str]) -> tuple[str, ...]:
+    """The names of a list that are estimators."""
+    known, names = usable_estimators(), dict.fromkeys(text.split(",") if text else ())
+    unknown = [show(name) for name in names if name not in known][:MAX_NAMED]
+    if unknown:
+        remarks.append(f"the estimator {' or '.join(unknown)} is unknown, so it is not compared.")
+    return tuple(name for name in names if name in known)
 
 
 def _viewpoint(text: str) -> tuple[float, ...]:

@@ -31,6 +31,7 @@ from spherloc_viz.app.history import History
 from spherloc_viz.app.link import Followed, Follower, PageView, address_html, link_of
 from spherloc_viz.app.map_pictures import MapPictures
 from spherloc_viz.app.page_runs import Known, PageRuns
+from spherloc_viz.app.panels.compare_panel import VIEW as COMPARE
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.review.opened import Opened
@@ -316,19 +317,26 @@ class Session:
             key = _step_key(self._run.trace, followed)
             remarks += followed.missing(key, kept)
             self._display.panels.steps.go(key)
-            self._display.panels.open_tab(followed.view.tab)
+            compared = followed.view.compared
+            self._display.panels.open_tab(followed.view.tab, COMPARE if compared else "")
+            self._controls.compare.follow(self._run.trace, compared)
             if followed.view.viewpoint:
                 self._display.canvas.hold(key, followed.view.viewpoint)
         if remarks:
             self._status.complain(" ".join(begun(remark) for remark in remarks), lasting=True)
 
     def _view(self) -> PageView:
-        """Step, selection, viewer, hidden answers and tab of the page, for its link."""
+        """What the page shows of its run, for its link."""
         display, run = self._controls.display, self._run
         selected = () if run is None else tuple(run.kept[list(self._edits.places(run.kept))].tolist())
-        viewpoint = self._display.canvas.viewpoint()
         return PageView(
-            self._display.step_key, selected, display.theme, display.answers_hidden, viewpoint, self._display.panels.tab
+            self._display.step_key,
+            selected,
+            display.theme,
+            display.answers_hidden,
+            self._display.canvas.viewpoint(),
+            self._display.panels.tab,
+            () if run is None else self._controls.compare.compared(run.trace),
         )
 
     def _open_linked(self, file: str) -> Opened:

@@ -160,6 +160,14 @@ def test_compare(page: Playground, scene: Path) -> None:
     tab.press("New seed")
     until_compared(tab, third)
     tab.until(lambda: is_shown(tab, "/comparison/mc-exact"), "the cameras are there again")
+
+    # The address names what is compared: a reload compares again, with the tab in front.
+    listed = "%2C".join(compared_rows(tab))
+    expect(tab.page).to_have_url(re.compile(f"&seed=5&estimator=ransac-2p&.*&compare={listed}$"))
+    tab.page.reload()
+    until_compared(tab, third)
+    expect(tab.page.get_by_role("tab", name="Compare")).to_have_attribute("aria-selected", "true")
+    tab.until(lambda: is_shown(tab, "/comparison/mc-exact"), "the cameras are there after a reload")
     assert tab.errors == []
 
 

@@ -81,6 +81,8 @@ class Comparison:
     """The comparison of one problem, as far as it has come."""
 
     problem: Problem
+    names: tuple[str, ...]
+    """Of the estimators that are compared."""
     entries: tuple[Entry, ...] = ()
     charts: tuple[Chart, ...] = ()
     items: tuple[SceneItem, ...] = ()
@@ -133,6 +135,21 @@ class ComparePanel:
             self._start(LIVE_AFTER_S)
         self._show()
 
+    def compared(self, trace: Trace) -> tuple[str, ...]:
+        """Names of the estimators that were compared on the problem of a run; none if another problem was compared."""
+        with self._lock:
+            done = self._done
+        same = done is not None and is_same(done.problem, trace.problem)
+        return done.names if done is not None and same else ()
+
+    def follow(self, trace: Trace, names: Sequence[str]) -> None:
+        """Compare estimators on the problem of a run, as a link asks for; without names, nothing."""
+        if names and set(names) != set(self.compared(trace)):
+            with self._lock:
+                self._ticked = set(names)
+                self._choice.content = chips_html("compare", self._names, self._ticked)
+            self._start(trace=trace)
+
     def items(self, trace: Trace) -> tuple[SceneItem, ...]:
         """What the canvas shows beside a run while this panel is seen; nothing if another problem was compared."""
         done = self._done if self._seen else None
@@ -174,31 +191,32 @@ class ComparePanel:
         if touch.argument in self._names:
             self._use(touch.argument)
 
-    def _start(self, after_s: float = 0.0) -> None:
-        """Compare after a while, and end the comparison at hand."""
+    def _start(self, after_s: float = 0.0, trace: Trace | None = None) -> None:
+        """Compare after a while, on the problem of a run or else of the one that is shown then, and end the comparison
+        at hand."""
         self._halt()
-        self._background.ask(partial(self._work, after_s))
+        self._background.ask(partial(self._work, after_s, trace))
 
     def _halt(self) -> None:
         """End the comparison at hand, also within a run."""
         self._stop.set()
         self._watch.cancel()
 
-    def _work(self, after_s: float) -> None:
+    def _work(self, after_s: float, trace: Trace | None) -> None:
         stop = self._stop = threading.Event()
         if stop.wait(after_s) or self._closed:
             return
         self._button.label, self._bar.visible = STOP, True
         try:
-            self._compare(stop)
+            self._compare(stop, trace)
         finally:
             self._button.label, self._bar.visible, self._status.visible = START, False, False
 
-    def _compare(self, stop: threading.Event) -> None:
+    def _compare(self, stop: threading.Event, of: Trace | None) -> None:
         """Run all and diagnose all, showing each as it comes. Raises ``InputError`` if there is nothing to
         compare, and in the end about each estimator that failed."""
         with self._lock:
-            trace, names = self._trace, [name for name in self._names if name in self._ticked]
+            trace, names = of or self._trace, [name for name in self._names if name in self._ticked]
         if trace is None:
             raise InputError("there is no run to compare with yet; wait for the first picture.")
         if not names:
@@ -218,13 +236,13 @@ class ComparePanel:
             except InputError as error:  # of one estimator: the others are compared
                 failures.append(str(error))
                 continue
-            self._publish(entries)
+            self._publish(names, entries)
         for place, entry in enumerate(entries):
             self._progress(place / len(names), f"Diagnosing {entry.trace.estimator} …")
             if stop.is_set() or self._closed:
                 return
             entries = (*entries[:place], replace(entry, diagnosis=diagnose(entry.trace)), *entries[place + 1 :])
-            self._publish(entries)
+            self._publish(names, entries)
         if failures:
             raise InputError(" ".join(failures))
 
@@ -236,11 +254,12 @@ class ComparePanel:
         self._status.content = status_html(begun(sentence), wrong=True)
         self._status.visible = True
 
-    def _publish(self, entries: tuple[Entry, ...]) -> None:
+    def _publish(self, names: Sequence[str], entries: tuple[Entry, ...]) -> None:
         charts = (residual_chart(entries), yaw_chart(entries))
         known = tuple(chart for chart in charts if chart is not None)
         with self._lock:
-            self._done = Comparison(entries[0].trace.problem, entries, known, comparison_items(entries))
+            problem = entries[0].trace.problem
+            self._done = Comparison(problem, tuple(names), entries, known, comparison_items(entries))
         self._changed(None)
         self._show()
 

@@ -6,9 +6,10 @@
 // new link with data-fetch leads to is downloaded. When another step comes, a panel that was scrolled past its title
 // shows its beginning.
 (() => {
-  const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150, REVEAL_MS = 3000;
-  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, titled = null;
-  let front = "", asked = "", told = "";  // the tabs of a step and of a link that were opened last, and the last report
+  const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150, FOLDED_LOOKS = 8, REVEAL_MS = 3000;
+  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, titled = null, hidden = 0;
+  // The tabs of a step and of a link that were opened last, among the views and elsewhere, and the last report.
+  let front = "", asked = "", elsewhere = "", told = "";
   const fetched = new Set();
 
   function found(event) {
@@ -40,13 +41,15 @@
     tell(`views:${report}`, nowhere, { clientX: 0, clientY: 0, shiftKey: false }, { x: 0, y: 0 });
   }
 
-  // Opens a tab of the views; false as long as it is not to be seen, unless its panel is folded. Tabs can be dragged, so
-  // that a click does nothing; Enter is what their own keys know.
+  // Opens a tab of the views; false as long as it is not to be seen, unless its panel is folded: then it has no place for
+  // a while, as it also has while the page is built. Tabs can be dragged, so that a click does nothing; Enter is what
+  // their own keys know.
   function openTab(name) {
     if ((seen ?? "").split(",").includes(name)) return true;
     const tab = [...document.querySelectorAll("[role=tab]")].find((one) => one.textContent.trim() === name);
     tab?.dispatchEvent(new KeyboardEvent("keydown", { key: "Enter", bubbles: true, cancelable: true }));
-    return tab !== undefined && tab.getClientRects().length === 0;
+    hidden = tab !== undefined && tab.getClientRects().length === 0 ? hidden + 1 : 0;
+    return hidden > FOLDED_LOOKS;
   }
 
   const linkedTab = () => document.querySelector("[data-tab]")?.dataset.tab ?? "";
@@ -61,10 +64,12 @@
     front = wanted;
   }
 
-  // Brings the tab to the front that a link asked for, "NAME NUMBER": as if a person had chosen it there.
+  // Brings the tabs to the front that a link asked for, "NAME NUMBER": as if a person had chosen them there.
   function followLink() {
-    const wanted = linkedTab();
-    if (wanted !== asked && seen !== null && (wanted === "" || openTab(wanted.split(" ")[0]))) asked = wanted;
+    const opens = (wanted) => wanted === "" || openTab(wanted.split(" ")[0]), wanted = linkedTab();
+    const another = document.querySelector("[data-elsewhere]")?.dataset.elsewhere ?? "";
+    if (wanted !== asked && seen !== null && opens(wanted)) asked = wanted;
+    if (another !== elsewhere && seen !== null && opens(another)) elsewhere = another;
   }
 
   function reveal() {

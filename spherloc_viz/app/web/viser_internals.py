@@ -169,25 +169,23 @@ def _changed(known: Any, props: dict[str, Any]) -> dict[str, Any]:
 
 
 def place_viewer(client: viser.ClientHandle, position: FloatArray, target: FloatArray) -> None:
-    """Put a client's viewer at a position (3,), where it looks at another place, the target (3,); sends what differs.
+    """Put a client's viewer at a position (3,), where it looks at another place, the target (3,).
 
     Setting the two on the camera sends the same, but viser then moves the target along with the position first, and
     works out twice how the viewer is turned.
     """
     camera = client.camera
     state = camera._state
-    updates: list[Any] = []
-    if not np.array_equal(state.position, position):
-        state.position = np.array(position, dtype=np.float64)
-        updates.append(_messages.SetCameraPositionMessage(tuple(position.tolist())))
-    if not np.array_equal(state.look_at, target):
-        state.look_at = np.array(target, dtype=np.float64)
-        updates.append(_messages.SetCameraLookAtMessage(tuple(target.tolist())))
-    if updates:
-        camera._update_wxyz()
-        state.update_timestamp = time.time()
-        for message in updates:
-            state.client._websock_connection.queue_message(message)
+    if np.allclose([state.position, state.look_at], [position, target]):
+        return
+    state.position, state.look_at = np.array(position, dtype=np.float64), np.array(target, dtype=np.float64)
+    camera._update_wxyz()
+    state.update_timestamp = time.time()
+    for message in (
+        _messages.SetCameraPositionMessage(tuple(position.tolist())),
+        _messages.SetCameraLookAtMessage(tuple(target.tolist())),
+    ):
+        state.client._websock_connection.queue_message(message)
 
 
 def put_handle(handle: Any, wxyz: Any, position: Any) -> None:
