@@ -1,6 +1,5 @@
 """One browser client: its own widgets, canvas, run and threads."""
 
-import re
 import secrets
 import time
 from collections import deque
@@ -52,8 +51,6 @@ VIEWER_STILL_S = 0.3
 """The address is updated when nothing was drawn and the viewer has not moved for this long."""
 DIAGNOSE_AFTER_S = 0.2
 """A diagnosis often takes longer than a run, so it starts only when the picture has not changed for this long."""
-MIN_PIXEL_RATIO, MAX_PIXEL_RATIO = 0.25, 8.0
-"""Numbers that a browser may give for the pixel density of its screen."""
 
 T = TypeVar("T")
 
@@ -188,10 +185,9 @@ class Session:
         self.changed()
 
     def _tell_numbers(self, touch: Touch) -> None:
-        """A lesson that shows this page in a frame asks for the numbers of its runs, and gives the pixel density."""
+        """A lesson that shows this page in a frame asks for the numbers of its runs."""
         self._in_lesson = True
-        ratio = float(touch.argument) if re.fullmatch(r"\d{1,2}(\.\d{1,9})?", touch.argument) else 1.0
-        self._display.canvas.fill_page(min(max(ratio, MIN_PIXEL_RATIO), MAX_PIXEL_RATIO))
+        self._display.canvas.fill_page()
         self._page.ask()
 
     def _reset(self, event: object) -> None:

@@ -4,7 +4,7 @@ function openScene(told) {
   const EVERY_MS = 150;
   const frame = Object.assign(document.createElement("iframe"), { title: "The live scene" });
   document.querySelector(".scene").append(frame);
-  let wanted = "", sent = "", landed = "", heard = false, toldRatio = "";
+  let wanted = "", sent = "", landed = "", heard = false;
 
   const inside = (selector) => frame.contentDocument?.querySelector(selector);
 
@@ -38,8 +38,7 @@ function openScene(told) {
       frame.contentWindow.location.replace(`/#${wanted}`);
       return;
     }
-    const ratio = frame.contentWindow.devicePixelRatio.toFixed(3);  // other words in large type
-    if (!said.dataset.numbers || ratio !== toldRatio) tell(`numbers:${toldRatio = ratio}`);
+    if (!said.dataset.numbers) tell("numbers:");
     else if (frame.contentWindow.location.hash === `#${said.dataset.address}`) {
       if (heard && landed === said.dataset.numbers) return;
       heard = true;

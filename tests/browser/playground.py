@@ -134,16 +134,19 @@ _spare_pages: WeakKeyDictionary[Browser, list[Page]] = WeakKeyDictionary()
 class Playground:
     """One tab."""
 
-    def __init__(self, browser: Browser, address: str, drawn: bool = False, new: bool = False) -> None:
+    def __init__(
+        self, browser: Browser, address: str, drawn: bool = False, new: bool = False, sharpness: float = SHARPNESS
+    ) -> None:
         """Open the page, wait for its first run and go to the run's last step; ``drawn`` has the canvas really drawn,
-        which is slow, and ``new`` is a browser that has never been here: it stays where the page opens."""
+        which is slow, and ``new`` is a browser that has never been here: it stays where the page opens, on a screen of
+        that ``sharpness``."""
         self._spare = None if drawn or new else _spare_pages.setdefault(browser, [])
         if self._spare:
             self.page = self._spare.pop()
         else:
             context = browser.new_context(
                 viewport=SIZE,  # pyright: ignore[reportArgumentType]
-                device_scale_factor=SHARPNESS,
+                device_scale_factor=sharpness,
                 reduced_motion="reduce",
             )
             context.add_init_script(ASIDE)

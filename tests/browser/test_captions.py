@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 from playground import SIZE, Playground
 from playwright.sync_api import Browser, expect
 
@@ -64,3 +65,27 @@ def test_a_phone_shows_the_canvas_and_what_the_step_says(browser: Browser, addre
     tab.page.set_viewport_size(SIZE)
     tab.expect_quiet(address)
     tab.close()
+
+
+def test_a_sharp_screen_and_a_zoomed_window_have_room_for_the_canvas(browser: Browser, address: str) -> None:
+    """A screen with several pixels for each of the page's is not taken for a larger one."""
+    tab = Playground(browser, address, new=True, sharpness=2.5)
+    tab.until(lambda: abs(tab.page.evaluate(WIDTH_PX) - 384) < 8, "the panel is as wide as on any screen")
+    expect(tab.page.get_by_role("tab", name="Play", exact=True)).to_be_visible()
+
+    tab.until(lambda: "step=bearings" in tab.page.evaluate("location.hash"), "the address holds the step")
+    tab.page.set_viewport_size({"width": 911, "height": 512})
+    tab.page.reload()
+    expect(tab.page.locator(".step-title").first).to_have_text("Bearings on the unit sphere")
+    expect(tab.page.get_by_role("tab", name="Play", exact=True)).to_have_count(0)
+    room = "() => document.querySelector('canvas').clientWidth"
+    tab.until(lambda: tab.page.evaluate(room) > 450, "the canvas has the room of the settings")
+    tab.page.get_by_label("Expand column").click()
+    expect(tab.page.get_by_role("tab", name="Play", exact=True)).to_be_visible()
+
+    tab.page.set_viewport_size({"width": 390, "height": 844})
+    tab.page.reload()
+    expect(tab.page.get_by_role("region", name="What the step says")).to_contain_text("Bearings on the unit sphere")
+    tab.until(lambda: np.ptp(tab.dots("/sphere/bearings")[:, 0]) > 0.5 * 390, "the sphere fills a phone's canvas")
+    tab.expect_quiet(address)
+    tab.page.context.close()

@@ -32,7 +32,7 @@ REFERENCE_DOT = 0.01
 MOVE_S = 1.0
 """Upper limit of the time in which the page moves its viewer smoothly (``smooth.js``)."""
 RESHAPED = 0.02
-"""Relative change of the canvas' aspect ratio from which on the view is fitted again."""
+"""Relative change of the canvas' aspect ratio, or of the width of its letters, from which on a view is fitted again."""
 
 
 class Canvas:
@@ -53,7 +53,6 @@ class Canvas:
         client.scene.set_up_direction("-y")
         self._client, self._display = client, display
         self._label_scale = LABEL_SCALE * text_scale(client.camera.image_width)
-        self._pixel_ratio = 1.0
         self._painter = Painter(client, picked, self._label_scale)
         self._camera = TrueCamera(client, moved)
         self._full_width = client.camera.image_width
@@ -61,9 +60,9 @@ class Canvas:
         self._step: tuple[str, str] | None = None
         self._followed: views.Viewpoint | None = None
         """The view that showed the subject of the last step that moved the viewer."""
-        self._looked: tuple[str | None, views.Viewpoint, float] | None = None
-        """The last view that was set: its name, or None for that of the step; the view; and the canvas' aspect
-        ratio."""
+        self._looked: tuple[str | None, views.Viewpoint, float, float] | None = None
+        """The last view that was set: its name, or None for that of the step; the view; the canvas' aspect ratio; and
+        the width of a letter in it."""
         self._taken_s = -math.inf
         """When that view was set, seconds of a monotonic clock."""
         self._held: tuple[str, views.Viewpoint] | None = None
@@ -119,10 +118,9 @@ class Canvas:
         self._held = step_key, views.Viewpoint(np.array(numbers[:3]), np.array(numbers[3:]), np.radians(degrees))
         self._looked, self._held_step_came = None, False
 
-    def fill_page(self, pixel_ratio: float) -> None:
-        """Use the whole page for the canvas, without panels, as in a lesson; ``pixel_ratio`` is the number of screen
-        pixels per CSS pixel."""
-        self._docked_px, self._pixel_ratio = 0, pixel_ratio
+    def fill_page(self) -> None:
+        """Use the whole page for the canvas, without panels, as in a lesson."""
+        self._docked_px = 0
         self._follow_page()
 
     def viewpoint(self) -> tuple[float, ...]:
@@ -171,7 +169,7 @@ class Canvas:
     def _letter(self) -> float:
         """Width of a letter in the canvas, as a share of half the canvas' height."""
         height_px = max(1, min(self._client.camera.image_height, MAX_PX))
-        return views.LETTER_PX * self._pixel_ratio * self._label_scale / (0.5 * height_px)
+        return views.LETTER_PX * self._label_scale / (0.5 * height_px)
 
     @property
     def clicked_left(self) -> bool:
@@ -244,7 +242,7 @@ class Canvas:
     def _take(self, name: str | None, view: views.Viewpoint, aspect: float) -> None:
         if name is None:
             self._followed = view
-        self._looked, self._taken_s = (name, view, aspect), time.monotonic()
+        self._looked, self._taken_s = (name, view, aspect, self._letter()), time.monotonic()
         picture = self._picture
         self._painter.see_from(view.position, picture is not None and views.inside(picture, view.position))
         views.look(self._client, view)
@@ -262,10 +260,14 @@ class Canvas:
             return
         if views.stands_at(self._client, views.START):  # a page that was still being built has dropped the view
             with self._lock:
-                self._take(*looked)
-        elif looked[0] != HELD and abs(np.log(self._aspect() / looked[2])) > RESHAPED and self._untouched():
+                self._take(*looked[:3])
+        elif looked[0] != HELD and self._is_reshaped(*looked[2:]) and self._untouched():
             with self._lock:
                 self._look(looked[0], picture)
+
+    def _is_reshaped(self, aspect: float, letter: float) -> bool:
+        """Whether the canvas' aspect ratio or the size of its letters is not what it was."""
+        return max(abs(math.log(self._aspect() / aspect)), abs(math.log(self._letter() / letter))) > RESHAPED
 
     def _aspect(self) -> float:
         """Width over height of the canvas."""

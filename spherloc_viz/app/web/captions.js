@@ -1,10 +1,11 @@
-// Two ways of showing a step with few words, for a lecture and for a phone. On a narrow screen the settings are folded
-// away at the start, and what the step says stands below the canvas, with Previous and Next. The projector view, key L or
-// an element of the class "projector-toggle", folds the panel on the right and has the view that goes with the step and,
-// in large type, what the step says on the left, for which it asks the server for room (projector:WIDTH of the window).
+// Two ways of showing a step with few words, for a lecture and for a phone. On a narrow screen, and in a zoomed window,
+// the settings are folded away at the start; on a narrow one what the step says stands below the canvas, with Previous
+// and Next. The projector view, key L or an element of the class "projector-toggle", folds the panel on the right and has
+// the view that goes with the step and, in large type, what the step says on the left, for which it asks the server for
+// room (projector:WIDTH of the window).
 (() => {
-  const EVERY_MS = 150, NARROW_PX = 600, FOLD = "Collapse panel area", UNFOLD = "Expand column";
-  let bar = null, words = null, projector = false, folded = false, toldWidth = 0;
+  const EVERY_MS = 150, NARROW_PX = 600, ROOMY_PX = 1000, FOLD = "Collapse panel area", UNFOLD = "Expand column";
+  let bar = null, words = null, projector = false, folded = false, roomMade = false, toldWidth = 0;
 
   // While the settings are unfolded on a narrow screen, they take it all.
   const small = () => innerWidth < NARROW_PX;
@@ -82,9 +83,18 @@
     title.click();
   }
 
+  // In a window that is not that narrow, as a zoomed one, two panels would leave a strip of the canvas.
+  function makeRoom() {
+    if (roomMade || small() || !document.querySelector("[data-ready]")) return;
+    const fold = innerWidth < ROOMY_PX ? rightmost(FOLD) : undefined;
+    roomMade = fold !== undefined || innerWidth >= ROOMY_PX;
+    fold?.click();
+  }
+
   function look() {
     if (!document.body) return; // the page is still being read
     foldSettings();
+    makeRoom();
     const wanted = (projector || narrow()) && document.querySelector(".step-words") && !document.querySelector(".introduction");
     document.body.classList.toggle("narrow", narrow());
     if (!wanted) {

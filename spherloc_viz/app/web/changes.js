@@ -47,10 +47,10 @@
       else if (data.message.type === "GuiUpdateMessage") this.#change(data.message);
       else {
         // All but the place of the viewer, which is told many times a second, has a number too.
-        const { type, name } = data.message;
+        const { type, name } = data.message, isView = type === "ViewerCameraMessage";
         if (type === "TransformControlsUpdateMessage") this.report(name, {});
-        else if (type !== "ViewerCameraMessage") this.report("", {});
-        super.postMessage(data, ...words);
+        else if (!isView) this.report("", {});
+        super.postMessage(isView ? { ...data, message: inPagePixels(data.message) } : data, ...words);
       }
     }
 
@@ -145,6 +145,13 @@
       if (updates) message.updates = Object.fromEntries(Object.entries(updates).filter(([key]) => key !== "answers"));
       return true;
     }
+  }
+
+  // viser tells the canvas' size in pixels of the screen, of which a sharp one has several for one of the page's, and a
+  // slow page draws fewer. Panels and words are measured in the page's.
+  function inPagePixels(message) {
+    const { clientWidth: width, clientHeight: height } = window.__viserMutable?.canvas ?? {};
+    return width && height ? { ...message, image_width: width, image_height: height } : message;
   }
 
   // viser's page takes messages in its next frame, which moves the viewer at once and still has the objects of before:
