@@ -170,7 +170,8 @@ def code_html(title: str, code: str) -> str:
         f'<span role="button" tabindex="0" aria-label="Copy as {escape(title)}" data-copy="{escape(code)}" '
         f'style="{link};{DIM}">copy</span>'
     )
+    named = f'tabindex="0" role="region" aria-label="{escape(title)}"'  # keys scroll what is longer
     return box(
-        f'<span style="font-weight:600">{escape(title)}</span>{copy}<pre style="{face};{look};{ground}">'
+        f'<span style="font-weight:600">{escape(title)}</span>{copy}<pre {named} style="{face};{look};{ground}">'
         f"{escape(code)}</pre>"
     )

@@ -321,4 +321,4 @@ def table_html(over: str, labels: Sequence[str], points: Sequence[Point]) -> str
     )
     body = f'<table style="border-collapse:collapse;width:100%"><tr><td></td>{head}</tr>{rows}</table>'
     css = "font-size:12px;font-variant-numeric:tabular-nums"
-    return box(f'<div style="max-height:{TABLE_PX}px;overflow:auto">{body}</div>', css)
+    return box(f'<div tabindex="0" style="max-height:{TABLE_PX}px;overflow:auto">{body}</div>', css)
