@@ -399,10 +399,10 @@ def test_a_link_counts_as_followed_when_its_step_is_drawn(house: House, monkeypa
     until(lambda: session._followed == 1)
     assert session._run is not None
     session._write_address(session._run)
-    assert "step=outcome" in session._address.content and 'data-followed="0"' in session._address.content
+    assert "step=outcome" in session._addresses[0].content and 'data-followed="0"' in session._addresses[0].content
     gate.set()
-    until(lambda: 'data-followed="1"' in session._address.content)
-    assert "step=bearings" in session._address.content
+    until(lambda: 'data-followed="1"' in session._addresses[0].content)
+    assert "step=bearings" in session._addresses[0].content
 
 
 def test_matches_are_selected_and_changed_by_hand(house: House) -> None:
@@ -506,7 +506,12 @@ def test_a_page_that_is_opened_by_a_link_begins_with_it(house: House, monkeypatc
     page.send({"type": "GuiUpdateMessage", "uuid": "", "updates": {"touch": json.dumps(press)}})
     until(lambda: len(house.notes.traces) == 1)
     assert solved == ["ransac-2p"] and session._run is not None and session._run.request.scene.seed == 6
-    until(lambda: "estimator=ransac-2p" in session._address.content and 'data-followed="1"' in session._address.content)
+    until(
+        lambda: (
+            "estimator=ransac-2p" in session._addresses[0].content
+            and 'data-followed="1"' in session._addresses[0].content
+        )
+    )
     session.step_history(-1)
     until(lambda: session._asked == deque() and session._controls.scene._seed.value == "6")
     assert solved == ["ransac-2p"] and len(house.notes.traces) == 1
@@ -567,9 +572,9 @@ def test_answers_are_hidden_until_they_are_asked_for(house: House) -> None:
     story.steps.go("bearings")
     until(lambda: HIDDEN in told())
     assert "inliers" not in told() and story._outcome.content == ""
-    until(lambda: "answers=hidden" in session._address.content)
+    until(lambda: "answers=hidden" in session._addresses[0].content)
     page.set(display._hide, False)
-    until(lambda: "Success" in told() and "answers=hidden" not in session._address.content)
+    until(lambda: "Success" in told() and "answers=hidden" not in session._addresses[0].content)
 
 
 def test_a_slow_run_gives_way_and_can_be_cancelled(house: House) -> None:

@@ -53,6 +53,8 @@ class LeftPanels:
             self._introduction, self._front, self._ready = gui.add_html(""), gui.add_html(""), gui.add_html("")
             gui.add_html(glossary_html())
             self._card = gui.add_html("")
+            self.address = gui.add_html("")
+            """For what the page's script is to keep as the address."""
         self._opening = self._of_step = self._asked = self._elsewhere = ""
         self.tab = TABS[0]
         """The view that a person or a link has brought to the front, for the page's link."""

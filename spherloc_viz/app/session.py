@@ -108,8 +108,10 @@ class Session:
         client.gui.add_html(READY)
         # And only then may it see where its address is kept: it tells the link that it was opened by at once.
         self._name = secrets.token_hex(8)
-        self._address = client.gui.add_html(address_html("", self._name, 0))
         self._display.panels.ready()
+        self._addresses = client.gui.add_html(""), self._display.panels.address
+        """Twice, since a panel that is folded tells nothing."""
+        self._tell_address(address_html("", self._name, 0))
 
     def start(self) -> None:
         """Solve and show the first problem, or the recorded run that was asked for; where the page was opened by a
@@ -474,7 +476,11 @@ class Session:
         recording = opened.recorded.row.file if opened is not None and opened.request == run.request else None
         link = link_of(run, self._view(), self._catalog, self._services.catalog.scenes, self._roots, recording)
         html = address_html(link, self._name, self._arrived, self._told_numbers(run.trace))
-        update_widget(self._address, content=html)
+        self._tell_address(html)
+
+    def _tell_address(self, html: str) -> None:
+        for widget in self._addresses:
+            update_widget(widget, content=html)
 
     def _told_numbers(self, trace: Trace) -> dict[str, str] | None:
         """The run's numbers for the lesson that shows this page in a frame; empty without a lesson."""

@@ -80,6 +80,10 @@ def test_a_sharp_screen_and_a_zoomed_window_have_room_for_the_canvas(browser: Br
     expect(tab.page.get_by_role("tab", name="Play", exact=True)).to_have_count(0)
     room = "() => document.querySelector('canvas').clientWidth"
     tab.until(lambda: tab.page.evaluate(room) > 450, "the canvas has the room of the settings")
+    tab.page.keyboard.press("n")
+    expect(tab.page).to_have_url(re.compile("step=(?!bearings)"))  # told though the settings are folded
+    tab.page.keyboard.press("b")
+    expect(tab.page).to_have_url(re.compile("step=bearings"))
     tab.page.get_by_label("Expand column").click()
     expect(tab.page.get_by_role("tab", name="Play", exact=True)).to_be_visible()
 

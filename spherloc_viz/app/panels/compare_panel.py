@@ -212,7 +212,7 @@ class ComparePanel:
         finally:
             self._button.label, self._bar.visible, self._status.visible = START, False, False
 
-    def _compare(self, stop: threading.Event, of: Trace | None) -> None:
+    def _compare(self, stop: threading.Event, of: Trace | None = None) -> None:
         """Run all and diagnose all, showing each as it comes. Raises ``InputError`` if there is nothing to
         compare, and in the end about each estimator that failed."""
         with self._lock:

@@ -83,9 +83,10 @@
     title.click();
   }
 
-  // In a window that is not that narrow, as a zoomed one, two panels would leave a strip of the canvas.
+  // In a window that is not that narrow, as a zoomed one, two panels would leave a strip of the canvas. A lesson, which
+  // shows the page in a frame, hides them itself.
   function makeRoom() {
-    if (roomMade || small() || !document.querySelector("[data-ready]")) return;
+    if (roomMade || small() || window !== window.top || !document.querySelector("[data-ready]")) return;
     const fold = innerWidth < ROOMY_PX ? rightmost(FOLD) : undefined;
     roomMade = fold !== undefined || innerWidth >= ROOMY_PX;
     fold?.click();
