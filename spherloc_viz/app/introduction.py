@@ -20,7 +20,7 @@ MOMENTS: tuple[Moment, ...] = (
         ("yaw-clique", "consensus-bound", "samples-needed"),
         "Pairs vote on the yaw",
         "Gravity is known, so the yaw and the position are left. Any two matches allow only an arc of yaws on the "
-        "ring; most arcs overlap where the camera really looks.",
+        "ring; more arcs overlap where the camera really looks than at any other yaw.",
     ),
     (
         ("clique", "consensus-clique", "samples-drawn"),
@@ -32,7 +32,7 @@ MOMENTS: tuple[Moment, ...] = (
         ("outcome",),
         "The pose, and your turn",
         "Green matches agree with the pose, red ones do not. Walk through the steps with Next and Previous, click a "
-        "dot to ask why it was rejected, drag a slider on the right: it is solved anew while you drag. Presets are "
+        "dot to ask why it was rejected, drag a slider of the settings: it is solved anew while you drag. Presets are "
         "simulations in which you choose how many matches are wrong.",
     ),
 )

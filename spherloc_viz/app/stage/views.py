@@ -233,7 +233,7 @@ def before_the_eyes(picture: Picture, position: FloatArray) -> frozenset[str]:
     surface = _surface(picture)
     if surface is None:
         return frozenset()
-    close_m = CLOSE * _ball(surface)[1]
+    close_m = CLOSE * _centre_and_radius(surface)[1]
     cameras = [item for item in picture.scene if isinstance(item, Segments) and item.layer == "cameras"]
     names = {item.name for item in cameras if len(item.points) and _apart(item, position) < close_m}
     if "cameras/estimate" in names:
@@ -249,7 +249,7 @@ def inside(picture: Picture, position: FloatArray) -> bool:
     if surface is None:
         return False
     camera = next((item for item in picture.scene if item.name == "cameras/estimate"), None)
-    centre, radius_m = _ball(surface)
+    centre, radius_m = _centre_and_radius(surface)
     apart_m = [float(np.linalg.norm(centre - position))]
     if isinstance(camera, Segments) and len(camera.points):
         apart_m.append(_apart(camera, position))
@@ -262,7 +262,7 @@ def _surface(picture: Picture) -> Mesh | None:
 
 
 @lru_cache(maxsize=8)
-def _ball(surface: Mesh) -> tuple[FloatArray, float]:
+def _centre_and_radius(surface: Mesh) -> tuple[FloatArray, float]:
     """Centre (3,) and radius, m, of the sphere."""
     low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
     return (low + high) / 2, float(high[0] - low[0]) / 2
@@ -316,7 +316,7 @@ def _sample(subject: FloatArray) -> FloatArray:
 def _behind(surface: Mesh, positions: FloatArray, targets: FloatArray) -> NDArray[np.bool_]:
     """Whether the sphere hides targets (K, 3) from positions (D, 3), as (D, K)."""
     sight = targets - positions[:, None]
-    centre, radius_m = _ball(surface)
+    centre, radius_m = _centre_and_radius(surface)
     to_centre = (centre - positions)[:, None]
     share = np.clip(np.sum(to_centre * sight, axis=2) / np.sum(sight**2, axis=2), 0.0, 1.0)
     return np.linalg.norm(share[..., None] * sight - to_centre, axis=2) < radius_m
@@ -327,7 +327,7 @@ def _inside(picture: Picture) -> Viewpoint:
     items = {item.name: item for item in picture.scene}
     surface = _surface(picture)
     assert surface is not None
-    centre, radius_m = _ball(surface)
+    centre, radius_m = _centre_and_radius(surface)
     axis = _axis(items)
     camera = items.get("cameras/estimate")
     if isinstance(camera, Segments):
@@ -429,5 +429,5 @@ def _subject(name: str, picture: Picture) -> FloatArray:
 def _sphere(surface: object, ring: bool) -> FloatArray:
     """The sphere with some room, or the ring around it."""
     assert isinstance(surface, Mesh)
-    centre, radius_m = _ball(surface)
+    centre, radius_m = _centre_and_radius(surface)
     return circle(centre, RING_ROOM * radius_m) if ring else sphere_box(centre, SPHERE_ROOM * radius_m)

@@ -7,10 +7,10 @@
 // shows its beginning.
 (() => {
   const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150, FOLDED_LOOKS = 8, REVEAL_MS = 3000;
-  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, titled = null, hidden = 0;
+  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, titled = null;
   // The tabs of a step and of a link that were opened last, among the views and elsewhere, and the last report.
   let front = "", asked = "", elsewhere = "", told = "";
-  const fetched = new Set();
+  const fetched = new Set(), hidden = {};  // downloads that were begun; and for how many looks a tab had no place
 
   function found(event) {
     const element = event.target instanceof Element ? event.target.closest(`${TOUCHABLE},a[href]`) : null;
@@ -33,6 +33,7 @@
 
   function look() {
     if (!document.querySelector("[data-ready]")) return;
+    document.documentElement.classList.add("opened");  // also when all panels are folded later
     seen = seenElements("[data-view]").map((view) => view.dataset.view).sort().join(",");
     const report = [seen, front, asked].join(";");
     if (report === told) return;
@@ -48,8 +49,8 @@
     if ((seen ?? "").split(",").includes(name)) return true;
     const tab = [...document.querySelectorAll("[role=tab]")].find((one) => one.textContent.trim() === name);
     tab?.dispatchEvent(new KeyboardEvent("keydown", { key: "Enter", bubbles: true, cancelable: true }));
-    hidden = tab !== undefined && tab.getClientRects().length === 0 ? hidden + 1 : 0;
-    return hidden > FOLDED_LOOKS;
+    hidden[name] = tab !== undefined && tab.getClientRects().length === 0 ? (hidden[name] ?? 0) + 1 : 0;
+    return hidden[name] > FOLDED_LOOKS;
   }
 
   const linkedTab = () => document.querySelector("[data-tab]")?.dataset.tab ?? "";
