@@ -142,6 +142,8 @@ def test_a_diagnosis_tells_cause_evidence_and_advice_and_is_quiet_about_good_run
         assert part in html
     short = diagnosis_html(wrong, whole=False)
     assert "Gravity prior off" in short and "The summary." in short and "<li" not in short and "advice" not in short
+    named = diagnosis_html(replace(wrong, advice="Raise bound_px."), whole=True)
+    assert "Raise Bound (px)." in named, "the page names an option as its settings do"
     quiet = diagnosis_html(replace(wrong, cause=Cause.OK, doubtful=False, evidence=()), whole=True)
     assert "The summary." in quiet and "advice" not in quiet and style.css(style.OUTLIER) not in quiet
 

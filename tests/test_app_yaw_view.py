@@ -18,6 +18,7 @@ from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.estimators import estimate
 from spherloc.estimators.mc import WIDEST_RAD
+from spherloc.geometry import yaw_rotation
 from spherloc.problem import Problem
 from spherloc.trace import RansacStage, Trace, YawStage
 from spherloc_viz.app.plots.yaw_view import PEAK, WHOLE, YawView, yaw_svg
@@ -304,21 +305,36 @@ def test_ransac_shows_its_hypotheses_and_a_press_goes_to_their_step(
     assert whole.count('opacity=".25"') == first.count('opacity=".25"') > 0, "what was tried later is faint"
 
 
-def test_the_curve_is_that_of_the_step(server: viser.ViserServer, runs: dict[str, Trace]) -> None:
+def test_curve_arcs_and_window_are_those_of_the_step(server: viser.ViserServer, runs: dict[str, Trace]) -> None:
     run = runs["mc"]
     keys = [step.key for step in steps(run)]
     view, _, _ = make(server)
     contents = {}
-    for key in ("yaw-arcs-10", "yaw-arcs", "yaw-candidate-1"):
-        (chart,) = (chart for chart in paint(run, keys.index(key)).charts if chart.name == "yaw")
+    for key in ("yaw-pair", "yaw-roots", "yaw-arcs-10", "yaw-arcs", "yaw-candidate-1", "yaw-clique"):
+        picture = paint(run, keys.index(key))
+        (chart,) = (chart for chart in picture.charts if chart.name == "yaw")
         view.draw(run, key, (), np.arange(120), step_chart=chart)
         contents[key] = view._html.content
-        story = at_step(yaw_story(run), chart)
+        story = at_step(yaw_story(run), chart, arcs_of(run, ()))
         assert story.top == chart.curves[0].y.max()
         assert (story.candidate_deg is not None) == (key == "yaw-candidate-1") == ("candidate" in contents[key])
-    assert len(set(contents.values())) == 3
-    view.draw(run, "outcome", (), np.arange(120))
-    assert view._html.content == contents["yaw-arcs"], "without a step about yaws, all arcs count"
+        assert (story.estimate_deg is not None) == (key == "yaw-clique") == ("estimate" in contents[key])
+        if key == "yaw-arcs-10":
+            low, high = window_on(view)
+            told = float(re.search(r"overlap, at (\S+?)°", picture.step.caption)[1].replace("−", "-"))
+            assert low < told < high, "the window is where the caption says that most of these arcs overlap"
+    assert len(set(contents.values())) == len(contents)
+    drawn = {key: content.count('class="yaw-arc"') for key, content in contents.items()}
+    assert drawn["yaw-pair"] == 1 and 1 <= drawn["yaw-roots"] <= 2 and drawn["yaw-arcs-10"] <= 10 < drawn["yaw-arcs"]
+
+
+def test_the_estimate_is_the_yaw_of_the_pose(runs: dict[str, Trace]) -> None:
+    """Refinement can correct gravity, and the yaw with it."""
+    run = runs["mc"]
+    turned = np.vstack([run.cam_from_map, [0.0, 0.0, 0.0, 1.0]])
+    turned[:3, :3] = turned[:3, :3] @ yaw_rotation(0.02)
+    moved = replace(run, cam_from_map=turned[:3])
+    assert abs(yaw_story(moved).estimate_deg - yaw_story(run).estimate_deg) > 0.5
 
 
 def window_on(view: YawView) -> tuple[float, float]:

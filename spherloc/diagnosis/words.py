@@ -99,9 +99,11 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
         case Cause.OK:
             return f"{run} of {total} matches agree within {px_text(bound)}, {_compared(e, truth, run)}."
         case Cause.TOO_FEW_INLIERS if truth is not None:
-            return f"Only {np.count_nonzero(truth.right)} of {total} matches are right, no more than chance gives."
+            right = int(np.count_nonzero(truth.right))
+            lucky = " The pose is right all the same, which only the truth can tell." if truth.success else ""
+            return f"Only {right} of {total} matches are right, {_by_chance(e, right, truth.within)}.{lucky}"
         case Cause.TOO_FEW_INLIERS:
-            return f"Only {best} of {total} matches agree with any pose, no more than chance gives."
+            return f"Only {best} of {total} matches agree with any pose, {_by_chance(e, best)}."
         case Cause.WRONG_REFERENCE:
             return f"None of {total} matches seems right: {best} agree with the best pose, no more than chance gives."
         case Cause.MAP_TOO_SPARSE:
@@ -119,6 +121,13 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
         case Cause.UNKNOWN:
             return f"The pose is off the true one, though {run} of {total} matches agree with it and fix it well."
     return _measured_summary(e, truth, cause, unit)
+
+
+def _by_chance(e: Evidence, size: int, wider: float = 1.0) -> str:
+    """Why a consensus of that size, within ``wider`` times the bound, is not believed."""
+    if size <= 2:
+        return "and any two agree with some pose"
+    return f"and {expected_text(e.nfa(size, wider))} sets of {size} are expected to agree with some pose by chance"
 
 
 def _narrow_summary(e: Evidence, narrow: Narrow) -> str:
@@ -180,7 +189,7 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
     if e.best is not None:
         best = e.best.support(bound)
         if e.run is None or best > e.run.support(bound):
-            yield f"A longer search finds a pose that {best} agree with."
+            yield f"{_finder(trace, best)} a pose that {best} agree with."
         if np.isfinite(e.position_sd_m):
             fixed = f"{_distance(e.position_sd_m, trace.problem.unit)} and {_deg(e.rotation_sd_rad)}"
             yield f"The {best} fix their pose to {fixed} (1 sd)."
@@ -199,6 +208,12 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
     yield from _proofs(trace, certificate)
     if truth is not None:
         yield from _truths(trace, e, truth)
+
+
+def _finder(trace: Trace, best: int) -> str:
+    """What found a pose that more agree with than with the run's: its own search, where refinement went on from it."""
+    known = trace.certificate is not None and best <= trace.certificate.lower_bound
+    return "Before refinement the run had" if known else "A longer search finds"
 
 
 def _proofs(trace: Trace, certificate: Certificate | None) -> Iterator[str]:

@@ -15,7 +15,7 @@ TERMS: dict[str, str] = {
     "yaw ring": "The circle around the unit sphere: a place on it is the direction in which the camera looks with some "
     "yaw. Its outline is as high as arcs overlap there.",
     "arc": "The yaws at which two matches can both be right, up to their noise: a piece of the yaw ring. A pair "
-    "has up to two, of which at most one is right.",
+    "has up to two, of which at most one holds the true yaw.",
     "root": "A yaw at which the line between a pair's points lies in the plane of its bearings. A pair has two or "
     "none, so it has up to two arcs.",
     "ball": "All camera positions that two matches allow, once the yaw is known: around the point where their rays "

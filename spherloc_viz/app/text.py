@@ -16,6 +16,8 @@ from spherloc_viz.layers.outcome import UNKNOWABLE, verdict
 from spherloc_viz.layers.primitives import Step, Table
 
 DIM = "opacity:.65"
+OPTIONS = {"bound_px": "Bound (px)", "noise_px": "Noise of an inlier (px)", "gravity_sd_deg": "Gravity sd (deg)"}
+"""What the settings call options that advice names as code does."""
 WITHHELD = "Answers are hidden. This part would show them: switch Hide answers off to see it."
 WORDS = {"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUTLIER, UNKNOWABLE: style.OUTLIER}
 """Values of a table that are shown in colour."""
@@ -31,8 +33,9 @@ def box(content: str, css: str = "") -> str:
     return f'<div class="words" style="padding:0 .8em .6em;font-size:13px;line-height:1.4;{css}">{content}</div>'
 
 
-def step_html(step: Step, caption_html: Callable[[str], str] = escape) -> str:
-    """Title, caption, equation and note of a step; ``caption_html`` makes HTML of the words of the caption."""
+def step_html(step: Step, caption_html: Callable[[str], str] = escape, end: str = "") -> str:
+    """Title, caption, equation and note of a step; ``caption_html`` makes HTML of the words of the caption. ``end``
+    says that it is the "first" or the "last" one, so that the page's script can disable a button."""
     parts = [
         '<div class="step-title" style="font-size:15px;font-weight:600;padding-bottom:.25em">'
         f"{escape(step.title)}</div>",
@@ -43,7 +46,7 @@ def step_html(step: Step, caption_html: Callable[[str], str] = escape) -> str:
         parts.append(f'<div class="step-equation" style="{face};padding-top:.4em;{DIM}">{escape(step.equation)}</div>')
     if step.note:
         parts.append(f'<div class="step-note" style="font-size:12px;padding-top:.35em;{DIM}">{escape(step.note)}</div>')
-    return box(f'<div class="step-words">{"".join(parts)}</div>')
+    return box(f'<div class="step-words" data-end="{end}">{"".join(parts)}</div>')
 
 
 def table_html(table: Table) -> str:
@@ -68,18 +71,25 @@ def diagnosis_html(diagnosis: Diagnosis, whole: bool) -> str:
         return box(f'<div style="{DIM}">{escape(diagnosis.summary)}</div>', "font-size:12px")
     color = style.css_text(style.OUTLIER)
     parts = [
-        f'<div style="font-weight:600;color:{color}">{escape(diagnosis.cause.capitalize())}</div>',
-        f"<div>{escape(diagnosis.summary)}</div>",
+        f"<div{' class=diagnosis-words' if whole else ''}>"
+        f'<div style="font-weight:600;color:{color}">{escape(diagnosis.cause.capitalize())}</div>'
+        f"<div>{escape(diagnosis.summary)}</div></div>",
     ]
     if whole:
         evidence = "".join(f'<li style="padding-bottom:.2em">{escape(line)}</li>' for line in diagnosis.evidence)
         known = "Judged with the truth." if diagnosis.used_truth else "Judged without the truth."
         parts += [
             f'<ul style="margin:.4em 0;padding-left:1.2em;font-size:12px">{evidence}</ul>' if evidence else "",
-            f"<div>{escape(diagnosis.advice)}</div>",
+            f"<div>{escape(_by_label(diagnosis.advice))}</div>",
             f'<div style="font-size:12px;padding-top:.35em;{DIM}">{known}</div>',
         ]
     return box("".join(parts))
+
+
+def _by_label(advice: str) -> str:
+    for name, label in OPTIONS.items():
+        advice = advice.replace(name, label)
+    return advice
 
 
 HIDDEN = "Answers are hidden"

@@ -126,13 +126,17 @@ def step_curve(label: str, counts: np.ndarray) -> Curve:
     return Curve(label, yaws, counts.astype(np.float64), style.UNDECIDED, "step")
 
 
+ESTIMATE = "estimate"
+"""Label of the estimated yaw's marker in a chart."""
+
+
 def markers(view: RunView, height: float, yaw_rad: float | None) -> list[Curve]:
     """The true yaw, if it is known, and the estimated one, if there is one yet, in a chart."""
     out = []
     if view.truth is not None:
         out.append(marker("truth", yaw_of(view.truth[:, :3]), height, style.TRUTH))
     if yaw_rad is not None:
-        out.append(marker("estimate", yaw_rad, height, style.ESTIMATE))
+        out.append(marker(ESTIMATE, yaw_rad, height, style.ESTIMATE))
     return out
 
 

@@ -1,6 +1,6 @@
 """Yaw: arcs of pairs gather on the ring around the sphere, candidate yaws are tried, and most arcs overlap at one."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from heapq import heappop, heappush
@@ -63,6 +63,11 @@ class StageArcs:
         pairs = len(same) - int(np.count_nonzero(same))
         several = int(np.count_nonzero(same[1:] & ~same[:-1]))
         return pairs - several, several
+
+    @property
+    def example_in_clique(self) -> int:
+        """The arc of the example over the estimated yaw."""
+        return int(self.example[np.argmax(self.in_clique[self.example])])
 
     @cached_property
     def example(self) -> IntArray:
@@ -183,7 +188,7 @@ def _pair(view: RunView, arcs: StageArcs) -> Frame:
     """A pair, and the arc of yaws that it allows."""
     example, stage = arcs.example, arcs.stage
     first, second = (int(number) for number in stage.pairs[example[0]])
-    k = int(example[np.argmax(arcs.in_clique[example])])
+    k = arcs.example_in_clique
     lo, hi = np.degrees(stage.lo_rad[k]), np.degrees(stage.hi_rad[k])
     also = ", and a second arc" if len(example) > 1 else ""
     d1, d2, d3 = pair_roots(view, first, second).wave
@@ -278,19 +283,13 @@ REACH = 40
 def plans(view: RunView, stage: YawStage) -> list[Plan]:
     """Steps for one pair with its arcs, more and more arcs, candidate yaws, and the largest overlap."""
     arcs = StageArcs(stage)
-    own = {"yaw": lambda: counts_chart(view, arcs.overlap_of(arcs.example).overlap)}
     out = [
-        Plan("yaw-pair", "One pair of matches", lambda: _pair(view, arcs)),
-        Plan(
-            "yaw-roots",
-            "The two roots of a pair",
-            lambda: _roots(view, arcs),
-            own,
-        ),
+        Plan("yaw-pair", "One pair of matches", lambda: _pair(view, arcs), _chart_of(view, arcs, "yaw-pair")),
+        Plan("yaw-roots", "The two roots of a pair", lambda: _roots(view, arcs), _chart_of(view, arcs, "yaw-roots")),
     ]
     for size in growing(len(arcs), *SIZES):
-        charts = {"yaw": partial(_growing_chart, view, arcs, size)}
-        out.append(Plan(f"yaw-arcs-{size}", f"{size:,} arcs", partial(_some, view, arcs, size), charts))
+        key = f"{GROWING}{size}"
+        out.append(Plan(key, f"{size:,} arcs", partial(_some, view, arcs, size), _chart_of(view, arcs, key)))
     out.append(Plan("yaw-arcs", "Yaw arcs of all pairs", lambda: _all(view, arcs), {"yaw": lambda: chart(view, stage)}))
     places = candidate_yaws(stage)
     for number, place in enumerate(places, 1):
@@ -301,6 +300,31 @@ def plans(view: RunView, stage: YawStage) -> list[Plan]:
     charts = {"yaw": lambda: chart(view, stage, found=True)}
     out.append(Plan("yaw-clique", "The yaw most arcs share", lambda: _clique(view, arcs), charts))
     return out
+
+
+GROWING = "yaw-arcs-"
+"""Beginning of the keys of steps that show the first few arcs; the number of these follows."""
+
+
+def chosen_arcs(arcs: StageArcs, key: str) -> IntArray | None:
+    """Indices of the arcs that a step shows, ascending; None if it shows all."""
+    if key == "yaw-pair":
+        return np.array([arcs.example_in_clique])
+    if key == "yaw-roots":
+        return arcs.example
+    size = key.removeprefix(GROWING)
+    return np.sort(arcs.spread(int(size))) if size != key and size.isdecimal() else None
+
+
+def _chart_of(view: RunView, arcs: StageArcs, key: str) -> dict[str, Callable[[], Chart]]:
+    """The chart of a step that shows some of the arcs."""
+
+    def draw() -> Chart:
+        chosen = chosen_arcs(arcs, key)
+        assert chosen is not None
+        return counts_chart(view, arcs.overlap_of(chosen).overlap)
+
+    return {"yaw": draw}
 
 
 def candidate_yaws(stage: YawStage) -> IntArray:
@@ -324,7 +348,7 @@ def _some(view: RunView, arcs: StageArcs, size: int) -> Frame:
     return Frame(
         f"With {size:,} of {len(arcs):,} arcs on the ring, at most {most:,} overlap, at "
         f"{np.degrees(found.yaw_rad):.2f}°{off}. "
-        "Arcs of wrong pairs lie anywhere, while those of right matches all hold the true yaw.",
+        "Arcs of wrong pairs lie anywhere; of two right matches, one arc holds the true yaw.",
         f"max over θ of Σ 1(|f(θ)| ≤ τ) = {most:,}   (Eq. 34)",
         start,
         view.colors(style.UNDECIDED),
@@ -429,10 +453,6 @@ def _ring(
     mask = np.zeros(len(drawn), dtype=bool) if marked is None else marked
     band = arcs.drawn(view, drawn, mask, mark)
     return band, ring.outline("ring/overlap", line, style.SPHERE), *ring.spokes(view, view.middle, None, yaws_rad)
-
-
-def _growing_chart(view: RunView, arcs: StageArcs, size: int) -> Chart:
-    return counts_chart(view, arcs.overlap_of(arcs.spread(size)).overlap)
 
 
 def counts_chart(view: RunView, counts: np.ndarray, yaw_rad: float | None = None) -> Chart:

@@ -14,7 +14,7 @@ from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.frame import RunView
 from spherloc_viz.layers.primitives import Chart, Curve
-from spherloc_viz.layers.yaw import CANDIDATE
+from spherloc_viz.layers.yaw import CANDIDATE, StageArcs, chosen_arcs
 
 Window = tuple[float, float]
 """Yaws from the first, in [-180, 180) degrees, to the second, which exceeds 180 where the window crosses the seam."""
@@ -41,6 +41,8 @@ class YawStory:
     """What is left out, as a sentence; may be empty."""
     candidate_deg: float | None = None
     """The candidate yaw of a step."""
+    peak_deg: float | None = None
+    """The yaw to look at: the estimate or, at a step, its candidate or the yaw that most of its arcs share."""
 
 
 def yaw_story(trace: Trace) -> YawStory:
@@ -56,7 +58,7 @@ def yaw_story(trace: Trace) -> YawStory:
     if yaw is not None:
         title, y_label = "Arcs that overlap at each yaw", "arcs"
         curves = (ring.step_curve("arcs that overlap", yaw.overlap),)
-        estimate = float(np.degrees(yaw.yaw_rad))
+        estimate = float(np.degrees(yaw.yaw_rad)) if estimate is None else estimate
     elif exact is not None:
         title, best = (
             "What a pose can explain at each yaw",
@@ -78,15 +80,7 @@ def yaw_story(trace: Trace) -> YawStory:
             for k, (pose, count, at) in enumerate(rows, 1)
         )
     values = [float(curve.y.max(initial=0.0)) for curve in curves] + [float(count) for _, count, *_ in tried]
-    return YawStory(title, y_label, curves, tried, max([1.0, *values]), estimate, truth, note)
-
-
-def at_step(story: YawStory, chart: Chart) -> YawStory:
-    """The story with the curves of a step's chart of the yaw: those of the arcs that the step shows."""
-    curves = tuple(curve for curve in chart.curves if curve.kind == "step")
-    yaws = [float(curve.x[0]) for curve in chart.curves if curve.label == CANDIDATE]
-    top = max([1.0, *(float(curve.y.max(initial=0.0)) for curve in curves)])
-    return replace(story, curves=curves, top=top, candidate_deg=yaws[0] if yaws else None)
+    return YawStory(title, y_label, curves, tried, max([1.0, *values]), estimate, truth, note, peak_deg=estimate)
 
 
 def _yaw_deg(trace: Trace, cam_from_map: FloatArray) -> float:
@@ -139,6 +133,8 @@ class PairArcs:
     """(A,) upper ends, not below ``lo_rad``."""
     rule: str
     """A sentence on the choice of the arcs; empty if they are the run's own."""
+    deepest_deg: float | None = None
+    """The yaw that most of them share, if the run has found it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +177,7 @@ def arcs_of(trace: Trace, selected: tuple[int, ...]) -> PairArcs:
     """The run's own arcs; if it stores none, those of some of its inliers, of the selection and of other matches."""
     stage = trace.stage(YawStage)
     if stage is not None:
-        return PairArcs(stage.pairs, stage.lo_rad, stage.hi_rad, "")
+        return PairArcs(stage.pairs, stage.lo_rad, stage.hi_rad, "", float(np.degrees(stage.yaw_rad)))
     aligned = trace.problem.aligned
     members = _members(trace, selected)
     places = np.searchsorted(aligned.index, members)
@@ -199,6 +195,29 @@ def arcs_of(trace: Trace, selected: tuple[int, ...]) -> PairArcs:
     return PairArcs(
         members[pairs], lo, hi, f"{trace.estimator} keeps no arcs; these are of the pairs of {whole} matches."
     )
+
+
+def arcs_of_step(arcs: PairArcs, trace: Trace, step_key: str) -> PairArcs:
+    """Of a run's arcs those that a step shows: all of them if it does not choose."""
+    stage = trace.stage(YawStage)
+    all_arcs = None if stage is None else StageArcs(stage)
+    chosen = None if all_arcs is None else chosen_arcs(all_arcs, step_key)
+    if all_arcs is None or chosen is None:
+        return arcs
+    deepest = float(np.degrees(all_arcs.overlap_of(chosen).yaw_rad))
+    some = arcs.pairs[chosen], arcs.lo_rad[chosen], arcs.hi_rad[chosen]
+    return PairArcs(*some, "Only arcs of this step are counted.", deepest)
+
+
+def at_step(story: YawStory, chart: Chart, arcs: PairArcs) -> YawStory:
+    """The story with the curves and the yaws of a step's chart of the yaw, which knows no estimate before its step;
+    ``arcs`` are the step's."""
+    curves = tuple(curve for curve in chart.curves if curve.kind == "step")
+    marked = {curve.label: float(curve.x[0]) for curve in chart.curves if curve.kind == "marker"}
+    candidate, estimate = marked.get(CANDIDATE), marked.get(ring.ESTIMATE)
+    peak = next((yaw for yaw in (estimate, candidate, arcs.deepest_deg) if yaw is not None), None)
+    top = max([1.0, *(float(curve.y.max(initial=0.0)) for curve in curves)])
+    return replace(story, curves=curves, top=top, candidate_deg=candidate, estimate_deg=estimate, peak_deg=peak)
 
 
 def _members(trace: Trace, selected: tuple[int, ...]) -> IntArray:
@@ -221,18 +240,18 @@ def sample(indices: IntArray, count: int) -> IntArray:
 
 
 def peak_window(story: YawStory, arcs: PairArcs) -> Window:
-    """A window around the estimated yaw, wide enough for most of the arcs over it; the circle without an estimate."""
-    if story.estimate_deg is None:
+    """A window around the yaw to look at, wide enough for most of the arcs over it; the circle without one."""
+    if story.peak_deg is None:
         return ALL
-    middle = np.radians(story.estimate_deg)
+    middle = np.radians(story.peak_deg)
     over = _overlapping(arcs, middle, middle)
     away = wrap_angle(arcs.lo_rad[over] - middle), wrap_angle(arcs.hi_rad[over] - middle)
     reach = np.maximum(np.abs(away[0]), np.abs(away[1]))
     need = 3.0 * np.degrees(float(np.median(reach))) if len(reach) else 10.0
     width = next((width for width in WIDTHS_DEG if width >= need), WIDTHS_DEG[-1])
-    # Rounded, so that the window does not move while a slider changes the estimate by little.
+    # Rounded, so that the window does not move while a slider changes the yaw by little.
     step = 0.1 * width
-    return window_around(step * round(story.estimate_deg / step), width)
+    return window_around(step * round(story.peak_deg / step), width)
 
 
 def _overlapping(arcs: PairArcs, low_rad: float, high_rad: float) -> NDArray[np.bool_]:

@@ -43,6 +43,14 @@ def test_the_projector_view_says_each_step_in_large_type(browser: Browser, addre
     tab.close()
 
 
+def tap(tab: Playground, x: float, y: float) -> None:
+    """Touch the page with a finger; a mouse is not the same, since what is under a finger captures it."""
+    fingers = tab.page.context.new_cdp_session(tab.page)
+    fingers.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [{"x": x, "y": y}]})
+    fingers.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    fingers.detach()
+
+
 def test_a_phone_shows_the_canvas_and_what_the_step_says(browser: Browser, address: str) -> None:
     tab = Playground(browser, address)
     tab.page.set_viewport_size({"width": 390, "height": 844})
@@ -53,8 +61,16 @@ def test_a_phone_shows_the_canvas_and_what_the_step_says(browser: Browser, addre
     bottom = "() => document.querySelector('#root').getBoundingClientRect().bottom"
     canvas, box = tab.page.evaluate(bottom), captions.bounding_box()
     assert box is not None and box["y"] >= canvas - 1, "the canvas ends where the caption begins"
+    onward = captions.get_by_role("button", name="Next step")
+    expect(onward).to_be_disabled()
+    tap(tab, *tab.lonely_dots()[0][1:])
+    expect(captions).to_contain_text(re.compile(r"Match \d+"))
+    captions.get_by_role("button", name="Deselect").click()
+    expect(captions).not_to_contain_text("Match")
+
     captions.get_by_role("button", name="Previous step").click()
     expect(captions).not_to_contain_text("Outcome")
+    expect(onward).to_be_enabled()
 
     settings = tab.page.get_by_text(re.compile("^spherloc$"))
     settings.click()

@@ -168,6 +168,11 @@ def test_compare(page: Playground, scene: Path) -> None:
     until_compared(tab, third)
     expect(tab.page.get_by_role("tab", name="Compare")).to_have_attribute("aria-selected", "true")
     tab.until(lambda: is_shown(tab, "/comparison/mc-exact"), "the cameras are there after a reload")
+    tab.tab("Share")
+    expect(tab.page.get_by_role("button", name="Picture (PNG)")).to_be_visible()
+    assert is_shown(tab, "/comparison/mc-exact"), "a picture can have them"
+    tab.tab("Open")
+    tab.until(lambda: not is_shown(tab, "/comparison/mc-exact"), "they do not linger")
     assert tab.errors == []
 
 

@@ -11,7 +11,7 @@ from spherloc.errors import InputError, show
 from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem
 from spherloc.ranges import check_option
-from spherloc_viz.app.text import status_html
+from spherloc_viz.app.text import OPTIONS, status_html
 from spherloc_viz.app.web.viser_internals import put, update_widget
 from spherloc_viz.options import NONE, OptionField, option_fields, usable_estimators
 
@@ -25,15 +25,15 @@ ABOUT: Mapping[str, str] = {
 START = "mc"
 """The estimator that a page starts with."""
 SLIDERS: Mapping[str, tuple[str, float, float, float]] = {
-    "bound_px": ("Bound (px)", 0.5, 20.0, 0.5),
-    "noise_px": ("Noise of an inlier (px)", 0.1, 5.0, 0.1),
+    "bound_px": (OPTIONS["bound_px"], 0.5, 20.0, 0.5),
+    "noise_px": (OPTIONS["noise_px"], 0.1, 5.0, 0.1),
     "max_balls": ("Most balls", 10, 1000, 10),
 }
 """Label, least, most and step of options that are best dragged."""
 PRESETS: Mapping[str, tuple[str, Mapping[str, float | None]]] = {
     "confidence": ("Confidence", {"draw them all": None, "0.9": 0.9, "0.99": 0.99, "0.999": 0.999, "0.9999": 0.9999}),
     "gravity_sd_deg": (
-        "Gravity sd (deg)",
+        OPTIONS["gravity_sd_deg"],
         {
             "as the problem states": None,
             "0: exact (4 DoF)": 0.0,

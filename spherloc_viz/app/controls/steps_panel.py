@@ -102,9 +102,10 @@ class StepsPanel:
         buttons = (PREVIOUS, NEXT, PAUSE if playing else PLAY)
         if self._buttons.options != buttons:
             self._buttons.options = buttons
+        end = "first" if self._index == 0 else "last" if self._index == len(self._steps) - 1 else ""
         texts = (
             (self._stages, stages_html(self._steps, self._index)),
-            (self._text, step_html(step, linked) + "".join(table_html(table) for table in tables)),
+            (self._text, step_html(step, linked, end) + "".join(table_html(table) for table in tables)),
         )
         for widget, html in texts:
             update_widget(widget, content=html)

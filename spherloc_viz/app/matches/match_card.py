@@ -105,6 +105,9 @@ class MatchCard:
         """
         if self._panel.visible != bool(selected):
             self._panel.visible = bool(selected)
+            if not selected:
+                self._drawn = None
+                update_widget(self._html, content="")
         drawn = (
             trace,
             selected,
@@ -139,7 +142,7 @@ def one_html(trace: Trace, what: Explanation, kept: NDArray, editable: bool) -> 
     look = f"color:{style.css_text(color)};font-weight:600" if color else "font-weight:600"
     head = f'<div>{_walk(what.number, kept)}{title} <span style="{look}">{escape(what.verdict)}</span></div>'
     body = f'<div style="padding-top:.3em">{escape(what.reason)}</div>{crops_html(trace.problem, what.number)}'
-    return box(head + body) + _actions(trace, 1, editable)
+    return _words(head + body) + _actions(trace, 1, editable)
 
 
 def untold_html(trace: Trace, selected: tuple[int, ...], kept: NDArray, editable: bool) -> str:
@@ -150,7 +153,7 @@ def untold_html(trace: Trace, selected: tuple[int, ...], kept: NDArray, editable
     else:
         head, crops = f"{len(selected):,} matches", ""
     title = f'<div style="font-size:15px;font-weight:600">{head}</div>'
-    return box(f"{title}{crops}") + _actions(trace, len(selected), editable)
+    return _words(f"{title}{crops}") + _actions(trace, len(selected), editable)
 
 
 def details_html(what: Explanation, kept: NDArray) -> str:
@@ -171,7 +174,12 @@ def many_html(trace: Trace, what: Traits, numbers: NDArray, editable: bool) -> s
     if trace.cam_from_map is not None and what.pairs:
         rows.append(("pairs that agree", f"{what.agree:,} of {what.pairs:,} at the estimated yaw"))
     table = Table("selection", ("", "these"), tuple(rows))
-    return box(head + body) + table_html(table) + _actions(trace, what.count, editable)
+    return _words(head + body) + table_html(table) + _actions(trace, what.count, editable)
+
+
+def _words(content: str) -> str:
+    """What a phone shows beside the words of the step too (``captions.js``)."""
+    return box(f'<div class="match-words">{content}</div>')
 
 
 def _walk(number: int, kept: NDArray) -> str:

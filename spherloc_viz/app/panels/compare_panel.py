@@ -17,6 +17,7 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.watch import Cancelled, Watch
 from spherloc_viz import style
+from spherloc_viz.app.panels.export_panel import VIEW as SHARE
 from spherloc_viz.app.plots.charts import chart_svg
 from spherloc_viz.app.text import DIM, WITHHELD, WORDS, begun, box, dot_html, status_html
 from spherloc_viz.app.web.touch import Touch, Touches, seen_views
@@ -151,7 +152,8 @@ class ComparePanel:
             self._start(trace=trace)
 
     def items(self, trace: Trace) -> tuple[SceneItem, ...]:
-        """What the canvas shows beside a run while this panel is seen; nothing if another problem was compared."""
+        """What the canvas shows beside a run while this panel is seen, and the one that makes pictures of the canvas if
+        it is opened next; nothing if another problem was compared."""
         done = self._done if self._seen else None
         return done.items if done is not None and is_same(done.problem, trace.problem) else ()
 
@@ -163,7 +165,8 @@ class ComparePanel:
 
     def _see(self, touch: Touch) -> None:
         """The page reports which tabs are open now."""
-        seen = VIEW in seen_views(touch.argument).names
+        names = seen_views(touch.argument).names
+        seen = VIEW in names or (self._seen and SHARE in names)
         if seen != self._seen:
             self._seen = seen
             self._changed(None)

@@ -21,6 +21,8 @@ from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.layers.primitives import SceneItem
 from spherloc_viz.recording.content.writer import write_recording
 
+VIEW = "Share"
+"""Name by which the page reports whether the panel can be seen."""
 PATIENCE_S = 60.0
 """A page that draws in software takes some ten seconds for a picture of its canvas."""
 WHERE = "Paths without a slash in front begin at the folder in which the playground was started; run the code there."
@@ -62,6 +64,7 @@ class ExportPanel:
         self._client, self._shown = client, shown
         self._background = BackgroundWorker(f"spherloc-export-{client.client_id}", self._complain)
         self._code: tuple[str, str] | None = None
+        gui.add_html(f'<div data-view="{VIEW}"></div>')
         gui.add_html(heading_html("Send what you see, or repeat it elsewhere", "recording"))
         gui.add_html(LINK)
         buttons = (

@@ -29,6 +29,7 @@ from spherloc_viz.layers.yaw_story import (
     Window,
     YawStory,
     arcs_of,
+    arcs_of_step,
     at_step,
     bars_in,
     peak_window,
@@ -313,15 +314,17 @@ class YawView:
         """
         with self._lock:
             wanted = self._wanted
-        story = untold(self._story(trace)) if hidden else self._story(trace)
-        if step_chart is not None:
-            story = at_step(story, step_chart)
+        story = self._story(trace)
         hypothesis = step_key.removesuffix("-pose")
         shown_key = hypothesis if any(hypothesis == key for *_, key in story.hypotheses) else ""
         drawn = (trace, shown_key, selected, wanted, hidden, step_chart)
         if self._drawn is not None and self._drawn[1:] == drawn[1:] and self._drawn[0] is trace:
             return
-        arcs = NO_ARCS if hidden else self._arcs_of(trace, selected)
+        arcs = NO_ARCS if hidden else arcs_of_step(self._arcs_of(trace, selected), trace, step_key)
+        if step_chart is not None:
+            story = at_step(story, step_chart, arcs)
+        if hidden:
+            story = untold(story)
         peak = peak_window(story, arcs)
         window = peak if wanted is None else wanted
         with self._lock:
@@ -374,7 +377,7 @@ def untold(story: YawStory) -> YawStory:
     """The story without its results: poses, their support, and the estimate."""
     curves = tuple(curve for curve in story.curves if curve.kind != "level")
     top = max([1.0, *(float(curve.y.max(initial=0.0)) for curve in curves)])
-    return replace(story, curves=curves, hypotheses=(), top=top, estimate_deg=None, note="")
+    return replace(story, curves=curves, hypotheses=(), top=top, estimate_deg=None, peak_deg=None, note="")
 
 
 def _window_of(argument: str) -> Window | None:

@@ -1,10 +1,12 @@
 // Two ways of showing a step with few words, for a lecture and for a phone. On a narrow screen, and in a zoomed window,
 // the settings are folded away at the start; on a narrow one what the step says stands below the canvas, with Previous
-// and Next. The projector view, key L or an element of the class "projector-toggle", folds the panel on the right and has
+// and Next, and with it what is said of a match that was tapped and, at the last step, of a failure. At either end of
+// the steps the button that leads on is disabled, here and in the panel. The projector view, key L or an element of the class "projector-toggle", folds the panel on the right and has
 // the view that goes with the step and, in large type, what the step says on the left, for which it asks the server for
 // room (projector:WIDTH of the window).
 (() => {
   const EVERY_MS = 150, NARROW_PX = 600, ROOMY_PX = 1000, FOLD = "Collapse panel area", UNFOLD = "Expand column";
+  const DESELECT = '<button class="deselect" data-touch="deselect:">Deselect</button>';
   let bar = null, words = null, projector = false, folded = false, roomMade = false, toldWidth = 0;
 
   // While the settings are unfolded on a narrow screen, they take it all.
@@ -46,13 +48,27 @@
 
   // Only what is new is written: a screen reader would read it again.
   function fill() {
-    const source = document.querySelector(".step-words");
-    if (!source) return;
-    const told = source.innerHTML;
+    const told = [".match-words", ".step-words", ".diagnosis-words"]
+      .filter((kind) => narrow() || kind === ".step-words")
+      .map((kind) => [kind, document.querySelector(kind)?.innerHTML])
+      .filter(([, html]) => html)
+      .map(([kind, html]) => `<div class="of-${kind.slice(1)}">${html}${kind === ".match-words" ? DESELECT : ""}</div>`)
+      .join("");
     if (words.dataset.told === told) return;
+    const match = (html) => html?.split("<div class=\"of-step-words\">")[0];
+    const walked = match(words.dataset.told) === match(told);
     words.dataset.told = told;
     words.innerHTML = told;
-    words.scrollTop = 0;
+    words.scrollTop = walked ? words.querySelector(".of-step-words").offsetTop - words.offsetTop : 0;
+  }
+
+  function markEnds() {
+    const end = document.querySelector(".step-words")?.dataset.end;
+    for (const one of document.querySelectorAll("button")) {
+      const name = one.textContent.trim();
+      const last = { "Previous": "first", "‹ Previous": "first", "Next": "last", "Next ›": "last" }[name];
+      if (last && one.disabled !== (end === last)) one.disabled = end === last;
+    }
   }
 
   function place() {
@@ -106,6 +122,7 @@
       fill();
       place();
     }
+    markEnds();
     const width = projector ? innerWidth : 0;
     if (width !== toldWidth && document.querySelector("[data-ready]")) {
       toldWidth = width;

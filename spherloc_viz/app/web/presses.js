@@ -1,6 +1,7 @@
 // A press counts for what was under the pointer when it went down, also if the page has moved beneath it before it went
 // up: a browser makes a click of the two only where both meet the same element. And who has chosen from a list goes on
-// with keys, which must not be written into its box.
+// with keys, which must not be written into its box. A finger on the canvas picks as a mouse does: a browser lets the
+// element under a finger capture it, and viser takes what is captured for a drag of one of its handles.
 (() => {
   const PRESSABLE = "button,a[href],label,summary,input,[role=option],[role=checkbox],[role=switch]", STILL_PX = 4;
   const AFTER_CHOICE_MS = 50;
@@ -9,6 +10,9 @@
   const pressable = (target) => (target instanceof Element ? target.closest(PRESSABLE) : null);
 
   addEventListener("pointerdown", (event) => {
+    if (event.pointerType === "touch" && event.target instanceof HTMLCanvasElement) {
+      event.target.releasePointerCapture(event.pointerId);
+    }
     const element = event.isPrimary && event.button === 0 ? pressable(event.target) : null;
     down = element && { element, x: event.clientX, y: event.clientY };
     clearTimeout(leaving);
