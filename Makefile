@@ -44,7 +44,7 @@ lint: ## Check style, format and types
 	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/python -m pyright || status=1; \
 	exit $$status
 
-bench: ## Measure spherloc beside its peers, some 70 minutes; a stopped run goes on
+bench: ## Measure spherloc beside its peers, about an hour; a stopped run goes on
 	@scripts/setup.sh bench
 	@exec $(BIN)/python -m benchmarks.run $(ARGS)
 
