@@ -19,7 +19,7 @@ from spherloc.problem import Problem
 from spherloc.trace import RefinementStage, Trace
 from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.frame import angle_text, icosphere, length_text
+from spherloc_viz.layers.frame import angle_text, icosphere, length, length_text
 from spherloc_viz.layers.primitives import Label, Mesh, Picture, Points, SceneItem, Segments, Textured
 from spherloc_viz.layers.query_image import DIM
 from spherloc_viz.layers.scene import round_length
@@ -116,8 +116,8 @@ def test_errors_are_drawn_and_said_as_the_metrics_have_them(turned: Trace) -> No
     assert isinstance(offset, Segments) and isinstance(angle, Segments)
     drawn, error = offset.points[0, 1] - offset.points[0, 0], camera_centre(truth) - camera_centre(estimated)
     degrees, _, rest = text(items["uncertainty/error"]).partition(" · ")
-    length, _, factor = rest.partition(", enlarged ")
-    assert length == length_text(float(np.linalg.norm(error)))
+    away, _, factor = rest.partition(", enlarged ")
+    assert away == length(float(np.linalg.norm(error)))
     np.testing.assert_allclose(drawn, int(factor.removesuffix("×") or 1) * error, atol=1e-9)
     assert degrees == f"error {angle_text(rotation_error_deg(truth, estimated))}"
     ways = angle.points[:2, 1] - angle.points[:2, 0]
@@ -133,7 +133,7 @@ def test_a_large_error_has_its_true_size(turned: Trace) -> None:
     away = replace(turned.problem, truth_cam_from_map=pose(truth[:, :3], truth[:, 3] + [0.0, 0.0, 40.0]))
     items = last(replace(turned, problem=away))
     offset = items["uncertainty/offset"]
-    assert isinstance(offset, Segments) and text(items["uncertainty/error"]).endswith(" · 40 m")
+    assert isinstance(offset, Segments) and text(items["uncertainty/error"]).endswith(" · 40.00 m")
     assert np.linalg.norm(offset.points[0, 1] - offset.points[0, 0]) == pytest.approx(40.0, rel=0.01)
 
 

@@ -105,8 +105,8 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
         caption += "The truth is unknown, so the share of agreeing matches is all there is to judge it by."
     else:
         verdict = "a success" if metrics.success else "a failure"
-        angle, length = angle_text(metrics.rotation_error_deg), view.length_text(metrics.translation_error_m)
-        limit = view.length_text(SUCCESS_M)
+        angle, length = angle_text(metrics.rotation_error_deg), view.length(metrics.translation_error_m)
+        limit = view.length(SUCCESS_M)
         caption += f"The pose is {angle} and {length} off the truth: {verdict} by the limits of 1° and {limit}."
     return Frame(
         caption,

@@ -158,7 +158,7 @@ def _error(view: RunView, stage: RefinementStage) -> Frame:
         happened = "The truth is not known here, so this cannot be checked."
     else:
         turned, away = rotation_error_deg(view.truth, state), translation_error_m(view.truth, state)
-        happened = f"In truth it is off by {angle_text(turned)} and {view.length_text(away)}."
+        happened = f"In truth it is off by {angle_text(turned)} and {view.length(away)}."
     return Frame(
         f"{expected} {happened}",
         "Σ = σ² (JᵀWJ)⁻¹",

@@ -97,7 +97,7 @@ def _offset(view: RunView, frame: Frame, factor: int) -> list[SceneItem]:
     factor = factor if factor * length_m <= ROOM * view.sphere_m else 1
     end = centre + factor * offset
     angle = angle_text(rotation_error_deg(view.truth, frame.cam_from_map))
-    text = f"error {angle} · {view.length_text(length_m)}{enlarged(factor)}"
+    text = f"error {angle} · {view.length(length_m)}{enlarged(factor)}"
     # Below the sphere if the error is within it, else just below the line.
     away = BESIDE if factor * length_m < 2.0 * view.sphere_m else 0.3
     below = 0.5 * (centre + end) + np.array([0.0, away * view.sphere_m, 0.0])

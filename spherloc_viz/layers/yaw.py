@@ -16,7 +16,7 @@ from spherloc.types import FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, one_color, ring_focus
-from spherloc_viz.layers.primitives import Chart, SceneItem, Segments
+from spherloc_viz.layers.primitives import Chart, SceneItem, Segments, true_minus
 
 INNER, OUTER = 1.3, 1.95
 """Radii of the band of arcs, in sphere radii."""
@@ -197,7 +197,7 @@ def _pair(view: RunView, arcs: StageArcs) -> Frame:
         f"Matches {first} and {second} can both be right only where the line between their points turns into the plane "
         f"of their bearings, and that fixes the yaw. With {view.trace.options.bound_px:.3g} px of noise it is an arc "
         f"of {hi - lo:.2g}°, from {lo:.2f}° to {hi:.2f}°{also}.",
-        f"{d1:.3g} cos θ {_signed(d2)} sin θ {_signed(d3)} = 0   (Eq. 22)",
+        f"{true_minus(f'{d1:.3g}')} cos θ {_signed(d2)} sin θ {_signed(d3)} = 0   (Eq. 22)",
         *_shown(view, (first, second), 0.5 * float(stage.lo_rad[k] + stage.hi_rad[k])),
         note=stage.rule,
         items=(
@@ -345,9 +345,9 @@ def _some(view: RunView, arcs: StageArcs, size: int) -> Frame:
     if len(drawn) < size:
         note += f" {len(drawn)} of these {size:,} are drawn."
     most, off = len(found.clique), ring.off_truth(view, found.yaw_rad)
+    meet = "no two overlap" if most == 1 else f"at most {most:,} overlap, at {np.degrees(found.yaw_rad):.2f}°{off}"
     return Frame(
-        f"With {size:,} of {len(arcs):,} arcs on the ring, at most {most:,} overlap, at "
-        f"{np.degrees(found.yaw_rad):.2f}°{off}. "
+        f"With {size:,} of {len(arcs):,} arcs on the ring, {meet}. "
         "Arcs of wrong pairs lie anywhere; of two right matches, one arc holds the true yaw.",
         f"max over θ of Σ 1(|f(θ)| ≤ τ) = {most:,}   (Eq. 34)",
         start,

@@ -42,7 +42,7 @@ class _Recipe:
 RECIPES = (
     _Recipe(
         "A quiet start",
-        "Sixty matches of a panorama, a third of them wrong: raise the outliers and watch the certificate.",
+        "Sixty matches of a panorama, 30 % of them wrong: raise the outliers and watch the certificate.",
         "panorama_outliers_80",
         0,
         Variation(correspondences=60, noise_px=0.5, outlier_rate=0.3),
