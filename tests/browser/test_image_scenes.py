@@ -98,6 +98,32 @@ def ringed(tab: Playground) -> list[str]:
     return tab.page.locator(f"svg text[fill='{SELECTED}']").all_text_contents()
 
 
+LIKENESS = """async lens => {
+    const pixels = await Promise.all([...lens.querySelectorAll("img")].map(async one => {
+        await one.decode();
+        const canvas = Object.assign(document.createElement("canvas"), {width: 128, height: 64});
+        const pen = canvas.getContext("2d");
+        pen.drawImage(one, 0, 0, 128, 64);
+        const {data} = pen.getImageData(0, 0, 128, 64);
+        return Array.from({length: 128 * 64}, (_, k) => (data[4 * k] + data[4 * k + 1] + data[4 * k + 2]) / 3);
+    }));
+    return pixels;
+}"""
+
+
+def expect_through_the_lens(tab: Playground) -> None:
+    """The map, seen from the estimated pose, looks like the photograph; buttons blend the two."""
+    lens = tab.page.get_by_role("img", name="The query and the map from the estimated pose: half and half")
+    expect(lens).to_be_visible()
+    photograph, seen = np.array(lens.evaluate(LIKENESS))
+    covered = np.abs(seen - 40.0) > 4.0
+    assert np.corrcoef(photograph[covered], seen[covered])[0, 1] > 0.7 and covered.mean() > 0.2
+    for blend, opacity in (("map", "1"), ("photograph", "0")):
+        tab.touch(f"lens:{blend}").click()
+        shown = tab.page.get_by_role("img", name=f"The query and the map from the estimated pose: {blend}")
+        expect(shown.locator("img").last).to_have_css("opacity", opacity)
+
+
 def recorded_queries(folder: Path) -> set[str]:
     return {read_recording(path).problem.name.split(", ")[1] for path in folder.glob("*.rrd")}
 
@@ -137,6 +163,7 @@ def test_queries_their_photographs_and_the_whole_sequence(
     tab.until(lambda: ringed(tab) == [str(number)] * 2, "both of its ends have rings")
     tab.until(lambda: tab.lit() == [number], "its point is lit")
     expect(tab.page.locator(".match-query")).to_be_visible()
+    expect_through_the_lens(tab)
 
     position = tab.value("camera position").inner_text()
     tab.choose("Query", "query_002")
