@@ -201,9 +201,9 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
     if e.free is not None and np.isfinite(e.free_tilt_sd_rad):
         one, two, four = (e.free.support(factor * bound) for factor in (1, 2, 4))
         yield (
-            f"With a pose fitted without gravity, {one} agree within the bound, {two} within twice and {four} within "
-            f"four times of it; gravity then tilts by {_deg(e.free.tilt_rad)}, "
-            f"give or take {_deg(e.free_tilt_sd_rad)}, and its bound is {_deg(e.aligned.gravity_bound_rad)}."
+            f"A pose fitted without gravity has {one} within the bound, {two} within twice and {four} within four "
+            f"times of it. Its vertical is {_deg(e.free.tilt_rad)} ± {_deg(e.free_tilt_sd_rad)} from the given gravity, "
+            f"which is said to be off by {_deg(e.aligned.gravity_bound_rad)} at most."
         )
     yield from _proofs(trace, certificate)
     if truth is not None:
