@@ -12,7 +12,7 @@ import viser
 
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.estimators import estimate
-from spherloc.trace import Trace
+from spherloc.trace import RefinementStage, Trace
 from spherloc_viz.app.plots.residual_view import (
     FOOT_PX,
     ResidualView,
@@ -24,6 +24,7 @@ from spherloc_viz.app.plots.residual_view import (
 from spherloc_viz.app.plots.shapes import Scale
 from spherloc_viz.app.server import start_viser, stop_viser
 from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.layers.refinement import chart
 from spherloc_viz.layers.residuals import history_of, residuals_of
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -120,6 +121,15 @@ def test_it_sends_only_what_changed_and_little(server: viser.ViserServer, run: T
     assert view._html.content != content
     view.draw(run, (), kept)
     assert view._html.content == content
+
+
+def test_how_the_residuals_fall_is_shown_once_there_are_two_steps(server: viser.ViserServer, run: Trace) -> None:
+    view = ResidualView(server.gui, Touches(print), lambda event: None, lambda ids: None)
+    stage = run.stage(RefinementStage)
+    assert stage is not None and len(stage.cost_px2) > 1
+    for last, shown in ((0, False), (1, True)):
+        view.draw(run, (), np.arange(100), chart(stage, last))
+        assert ("Residual during refinement" in view._html.content) == shown
 
 
 def test_runs_without_pose_or_truth_are_said_to_be(server: viser.ViserServer, run: Trace) -> None:

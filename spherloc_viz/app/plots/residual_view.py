@@ -190,7 +190,7 @@ class ResidualView:
             return
         _, residuals, scores, history_html = self._known
         bins: dict[str, Histogram] = {} if residuals is None else {one.unit: one for one in residuals.histograms}
-        fall = "" if cost is None else chart_html(cost)
+        fall = "" if cost is None or len(cost.curves[0].x) < 2 else chart_html(cost)  # a dot alone says nothing
         content = fall + _residuals_html(residuals, selected) + scores + history_html
         # A press on a histogram that has changed meanwhile selects the matches that are in that bin now.
         self._bins = bins
