@@ -14,9 +14,10 @@ from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.failures import MAKERS, failure_case
 from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, diagnose
-from spherloc.diagnosis.evidence import apart, pose_sd
+from spherloc.diagnosis.evidence import apart, gather, pose_sd
 from spherloc.estimators import default_options, estimate
 from spherloc.estimators.base import options_type
+from spherloc.metrics import evaluate
 from spherloc.problem import Problem
 from spherloc.refine import RefinementOptions, refine, residuals_px
 from spherloc.trace import ConsensusStage
@@ -206,3 +207,19 @@ def test_real_matches_that_fail_for_a_known_cause():
     }
     assert all(with_truth == cause for cause, (with_truth, _) in called.items()), called
     assert sum(without == cause for cause, (_, without) in called.items()) >= len(called) - 1, called
+
+
+def test_too_few_right_matches_are_said_to_be_a_matter_of_chance_only_if_they_are(scene_of):
+    reasons = set()
+    for count, seeds in ((12, range(8)), (100, range(4))):
+        scene = scene_of("mei", correspondences=count, outlier_rate=1.0 - 3.0 / count)
+        for seed in seeds:
+            run = estimate(scene.problem(seed), "mc", seed=seed)
+            said = diagnose(run)
+            if said.cause is not Cause.TOO_FEW_INLIERS or not said.summary.startswith(f"Only 3 of {count}"):
+                continue
+            by_chance = gather(run).nfa(3) >= 0.05
+            assert by_chance == ("sets of 3 are expected" in said.summary) != ("too few to be believed" in said.summary)
+            assert ("right all the same" in said.summary) == bool(evaluate(run).success)
+            reasons.add(by_chance)
+    assert reasons == {True, False}

@@ -123,11 +123,17 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
     return _measured_summary(e, truth, cause, unit)
 
 
+UNLIKELY = 0.05
+"""Expected number of sets by chance below which it is not chance that speaks against so few matches."""
+
+
 def _by_chance(e: Evidence, size: int, wider: float = 1.0) -> str:
     """Why a consensus of that size, within ``wider`` times the bound, is not believed."""
     if size <= 2:
         return "and any two agree with some pose"
-    return f"and {expected_text(e.nfa(size, wider))} sets of {size} are expected to agree with some pose by chance"
+    if (expected := e.nfa(size, wider)) < UNLIKELY:
+        return "too few to be believed"
+    return f"and {expected_text(expected)} sets of {size} are expected to agree with some pose by chance"
 
 
 def _narrow_summary(e: Evidence, narrow: Narrow) -> str:

@@ -1,9 +1,9 @@
 // Two ways of showing a step with few words, for a lecture and for a phone. On a narrow screen, and in a zoomed window,
 // the settings are folded away at the start; on a narrow one what the step says stands below the canvas, with Previous
-// and Next, and with it what is said of a match that was tapped and, at the last step, of a failure. At either end of
-// the steps the button that leads on is disabled, here and in the panel. The projector view, key L or an element of the class "projector-toggle", folds the panel on the right and has
-// the view that goes with the step and, in large type, what the step says on the left, for which it asks the server for
-// room (projector:WIDTH of the window).
+// and Next, and with it what is said of a match that was tapped and, at the last step, of a failure. The projector view,
+// key L or an element of the class "projector-toggle", folds the panel on the right and has the view that goes with the
+// step and, in large type, what the step says on the left, for which it asks the server for room (projector:WIDTH of the
+// window). At either end of the steps the button that leads on is disabled, in the panel too.
 (() => {
   const EVERY_MS = 150, NARROW_PX = 600, ROOMY_PX = 1000, FOLD = "Collapse panel area", UNFOLD = "Expand column";
   const DESELECT = '<button class="deselect" data-touch="deselect:">Deselect</button>';
@@ -66,6 +66,7 @@
     const end = document.querySelector(".step-words")?.dataset.end;
     for (const one of document.querySelectorAll("button")) {
       const name = one.textContent.trim();
+      if (one.closest(".introduction")) continue; // its Next is another one
       const last = { "Previous": "first", "‹ Previous": "first", "Next": "last", "Next ›": "last" }[name];
       if (last && one.disabled !== (end === last)) one.disabled = end === last;
     }

@@ -6,7 +6,8 @@
 // new link with data-fetch leads to is downloaded. When another step comes, a panel that was scrolled past its title
 // shows its beginning.
 (() => {
-  const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150, FOLDED_LOOKS = 8, REVEAL_MS = 3000, COPIED_MS = 5000;
+  const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150, FOLDED_LOOKS = 8;
+  const REVEAL_MS = 3000, COPIED_MS = 5000;
   let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, titled = null;
   // The tabs of a step and of a link that were opened last, among the views and elsewhere, and the last report.
   let front = "", asked = "", elsewhere = "", told = "";
