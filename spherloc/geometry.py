@@ -72,7 +72,9 @@ def tangent_basis(directions: FloatArray) -> FloatArray:
 
 def pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
     """[R | t] (3, 4)."""
-    return np.column_stack([rotation, translation])
+    matrix = np.empty((3, 4))
+    matrix[:, :3], matrix[:, 3] = rotation, translation
+    return matrix
 
 
 def level_poses(yaws_rad: FloatArray, translations: FloatArray) -> FloatArray:

@@ -17,6 +17,8 @@ PRIOR_GROUPS = 10.0
 """Weight of the prior: as if this number of groups of matches with the stated noise had been measured before."""
 SHARED_PX = 0.15
 """Error that all matches share, px: no calibration or map is more accurate, however many matches there are."""
+_RIDGE = 1e-12
+"""Added to the diagonal of a scaled information matrix, for the inverse where a direction is undetermined."""
 _GENERIC_DIRECTION = np.array([0.7390851332151607, 0.5671432904097838, 0.9159655941772190])
 """A direction in which no two different points have the same coordinate, for practical purposes."""
 
@@ -32,15 +34,7 @@ def variance_factor(
         return 1.0
     groups = _groups(matches.points[inliers], matches.bearings[inliers])
     count = int(groups.max()) + 1
-    information, scores = np.zeros((6, 6)), np.zeros((count, 6))
-    _add_up(matches, inliers, groups, cam_from_map, float(noise_px), information, scores)
-    squares = scores.T @ scores
-    if dof == 4:
-        without_tilt = np.ix_((1, 3, 4, 5), (1, 3, 4, 5))
-        information, squares = information[without_tilt], squares[without_tilt]
-    scale = 1.0 / np.maximum(np.sqrt(np.diagonal(information)), 1e-300)
-    scale = scale[:, None] * scale
-    factor = np.trace(np.linalg.solve(information * scale + 1e-12 * np.eye(dof), squares * scale)) / dof
+    factor = _sum_of_squares(matches, inliers, groups, cam_from_map, float(noise_px), dof, np.zeros((count, 6))) / dof
     # Each of the two rows of a residual loses half of the pose's degrees of freedom.
     factor *= count / max(count - 0.5 * dof, 1.0)
     factor = (PRIOR_GROUPS + count * factor) / (PRIOR_GROUPS + count)
@@ -49,13 +43,14 @@ def variance_factor(
 
 
 @kernel()
-def _add_up(matches, inliers, groups, cam_from_map, noise_px, information, scores):
-    """Add the sum of J' J to ``information`` (6, 6), and the scores J' r to the ``scores`` (G, 6) of their groups.
+def _sum_of_squares(matches, inliers, groups, cam_from_map, noise_px, dof, scores):
+    """trace((sum J' J)^-1 B), where B is the sum of the outer products of the groups' scores.
 
-    J is of a step (w, d), rad and m, from the pose ``cam_from_map`` (3, 4). ``groups`` (K,) are the numbers of the
-    groups of the ``inliers`` (M,) among the ``matches``; residuals count in units of ``noise_px``.
+    J is of a step (w, d), rad and m, from the pose ``cam_from_map`` (3, 4), in the order w_x, w_z, w_y, d: a pose with
+    4 for ``dof`` moves by the last four. ``groups`` (K,) are the numbers of the groups of the ``inliers`` (M,) among
+    the ``matches``; residuals count in units of ``noise_px``. Zeros ``scores`` (G, 6) are overwritten.
     """
-    jacobian, n = np.empty(6), 0
+    jacobian, n, information = np.empty(6), 0, np.zeros((6, 6))
     for k in range(len(inliers)):
         if not inliers[k]:
             continue
@@ -75,7 +70,7 @@ def _add_up(matches, inliers, groups, cam_from_map, noise_px, information, score
             residual = by_x * x + by_y * y + by_z * z
             by_x, by_y, by_z = by_x - residual * x, by_y - residual * y, by_z - residual * z
             # A rotation w moves the ray by w x ray at any distance; a translation d by d / distance.
-            jacobian[0], jacobian[1], jacobian[2] = y * by_z - z * by_y, z * by_x - x * by_z, x * by_y - y * by_x
+            jacobian[0], jacobian[1], jacobian[2] = y * by_z - z * by_y, x * by_y - y * by_x, z * by_x - x * by_z
             jacobian[3], jacobian[4], jacobian[5] = by_x / length, by_y / length, by_z / length
             for a in range(6):
                 jacobian[a] /= noise_px
@@ -83,9 +78,25 @@ def _add_up(matches, inliers, groups, cam_from_map, noise_px, information, score
                 for b in range(a + 1):
                     information[a, b] += jacobian[a] * jacobian[b]
         n += 1
-    for a in range(6):
-        for b in range(a):
-            information[b, a] = information[a, b]
+    # With L L' = sum J' J, scaled to a diagonal of 1, the trace is that of the sum of |L^-1 s|^2 over the scores s.
+    first, total, scale = 6 - dof, 0.0, np.ones(6)
+    for a in range(first, 6):
+        if information[a, a] > 0.0:
+            scale[a] = 1.0 / np.sqrt(information[a, a])
+    for a in range(first, 6):
+        for b in range(first, a + 1):
+            rest = information[a, b] * scale[a] * scale[b]
+            for k in range(first, b):
+                rest -= information[a, k] * information[b, k]
+            information[a, b] = rest / information[b, b] if a > b else np.sqrt(rest + _RIDGE)
+    for g in range(len(scores)):
+        for a in range(first, 6):
+            rest = scores[g, a] * scale[a]
+            for k in range(first, a):
+                rest -= information[a, k] * scores[g, k]
+            scores[g, a] = rest / information[a, a]
+            total += scores[g, a] ** 2
+    return total
 
 
 def _groups(points: FloatArray, bearings: FloatArray) -> IntArray:

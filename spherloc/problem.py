@@ -248,13 +248,13 @@ class AlignedProblem:
 
     def unalign_pose(self, cam_from_map: FloatArray) -> FloatArray:
         """The pose (3, 4) between the problem's own frames, from one between the aligned frames."""
-        rotation = self.camera_turn.T @ cam_from_map[:, :3] @ self.map_turn
-        return pose(rotation, self.camera_turn.T @ cam_from_map[:, 3])
+        return self.unalign_poses(cam_from_map[None])[0]
 
     def unalign_poses(self, cam_from_map: FloatArray) -> FloatArray:
-        """``unalign_pose`` of each of P poses (P, 3, 4)."""
-        rotations = self.camera_turn.T @ cam_from_map[:, :, :3] @ self.map_turn
-        return np.concatenate([rotations, (cam_from_map[:, :, 3] @ self.camera_turn)[:, :, None]], axis=2)
+        """``unalign_pose`` of each of P poses (P, 3, 4): the same to the last bit, as products of stacks are."""
+        turned = self.camera_turn.T @ cam_from_map
+        turned[:, :, :3] = turned[:, :, :3] @ self.map_turn
+        return turned
 
     def align_pose(self, cam_from_map: FloatArray) -> FloatArray:
         """The inverse of ``unalign_pose``."""

@@ -192,7 +192,7 @@ def record(
         dof, centre, steps = _step_covariance(matches, inliers, last, measured_noise, ROBUST_NONE)
     stage = RefinementStage(
         dof=dof,
-        cam_from_map=_unaligned(aligned, path),
+        cam_from_map=aligned.unalign_poses(path),
         cost_px2=costs,
         inlier_counts=counts,
         covariance=_covariance(aligned, last, centre, steps),
@@ -202,22 +202,15 @@ def record(
     return last, inliers, stage
 
 
-def _unaligned(aligned: AlignedProblem, path: FloatArray) -> FloatArray:
-    """Poses (K, 3, 4) of the problem's own frames. The ends are those of ``unalign_pose`` to the last bit."""
-    turned = aligned.unalign_poses(path)
-    turned[0], turned[-1] = aligned.unalign_pose(path[0]), aligned.unalign_pose(path[-1])
-    return turned
-
-
 def _covariance(aligned: AlignedProblem, cam_from_map: FloatArray, centre: FloatArray, steps: FloatArray) -> FloatArray:
     """Covariance (6, 6) as in ``RefinementStage``, from that of a step (w, d) about ``centre`` (3,), aligned frames."""
     rotation = cam_from_map[:, :3]
     middle = rotation @ centre + cam_from_map[:, 3]
     # The position -R^T t = c - R^T m moves by R^T (w x m - d).
-    by_step = np.zeros((6, 6))
+    by_step, to_map = np.zeros((6, 6)), -(rotation @ aligned.map_turn).T
     by_step[:3, :3] = aligned.camera_turn.T
-    by_step[3:, :3] = -aligned.map_turn.T @ rotation.T @ skew(middle)
-    by_step[3:, 3:] = -aligned.map_turn.T @ rotation.T
+    by_step[3:, :3] = to_map @ skew(middle)
+    by_step[3:, 3:] = to_map
     return by_step @ steps @ by_step.T
 
 

@@ -4,6 +4,7 @@ from math import lgamma
 
 import numpy as np
 
+from spherloc.kernel_cache import kernel
 from spherloc.types import FloatArray
 
 NEIGHBOURHOOD_RAD = 0.2
@@ -19,12 +20,21 @@ def chance_rate(bearings: FloatArray, bound_rad: FloatArray) -> float:
     It is counted in a wider neighbourhood and scaled by the areas of both caps, so that bearings which are all in one
     part of the image meet more often by chance than bearings all around. ``bearings`` (M, 3), ``bound_rad`` (M,).
     """
-    step = -(-len(bearings) // MAX_BEARINGS)
-    some = bearings[::step]
-    near = np.count_nonzero(some @ some.T >= np.cos(NEIGHBOURHOOD_RAD)) - len(some)
-    density = max(near, 1) / (len(some) * max(len(some) - 1, 1))
+    some = bearings[:: -(-len(bearings) // MAX_BEARINGS)].copy()
+    density = max(2 * _pairs_within(some, np.cos(NEIGHBOURHOOD_RAD)), 1) / (len(some) * max(len(some) - 1, 1))
     cap = np.mean(np.sin(0.5 * bound_rad) ** 2) / np.sin(0.5 * NEIGHBOURHOOD_RAD) ** 2
     return float(min(1.0, density * cap))
+
+
+@kernel()
+def _pairs_within(bearings, cosine):
+    """How many pairs of the unit ``bearings`` (M, 3) are closer than the angle with this ``cosine``."""
+    near = 0
+    for i in range(len(bearings)):
+        x, y, z = bearings[i, 0], bearings[i, 1], bearings[i, 2]
+        for j in range(i):
+            near += x * bearings[j, 0] + y * bearings[j, 1] + z * bearings[j, 2] >= cosine
+    return near
 
 
 def expected_text(sets: float) -> str:

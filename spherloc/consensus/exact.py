@@ -11,6 +11,7 @@ One pair may own two arcs: an edge is cleared when the last one ends.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +34,11 @@ from spherloc.consensus.pair_arcs import CIRCLE, pair_arcs, turn_of, yaws_betwee
 from spherloc.consensus.region_proof import FOUND, IMPOSSIBLE, UNKNOWN, Region, prove_none, search_region
 from spherloc.consensus.translation_balls import apart_balls, may_be_seen, pair_ball, star_balls
 from spherloc.consensus.yaw_bins import BIN_TURN, BINS, core_graph, degree_bounds, largest_bin_cliques, sort_into_bins
-from spherloc.geometry import yaw_rotation
+from spherloc.geometry import level_poses
 from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.small_arrays import elements, fill_matrix, fill_vector
-from spherloc.types import BoolArray, FloatArray, IndexArray
+from spherloc.types import BoolArray, FloatArray, IndexArray, IntArray
 from spherloc.watch import DONE, SELDOM, TOTAL, Watch, stopped, working_s
 
 DOUBTFUL_NFA = 1e-6
@@ -85,14 +86,7 @@ class ExactConsensus:
 
     def bound_over_yaw(self, bins: int) -> IndexArray:
         """``bound`` by yaw, from -pi upwards in an even number of equal steps."""
-        ends = turn_of(np.linspace(-np.pi, np.pi, bins + 1)) / BIN_TURN
-        first = np.floor(ends[:-1] + 1e-9).astype(int) % BINS
-        last = np.maximum(first, np.ceil(ends[1:] - 1e-9).astype(int) - 1)
-        last = np.where(ends[1:] < ends[:-1], BINS - 1, last)  # the bin that ends at turn 0
-        most = np.zeros(bins, np.int32)
-        for more in range(int((last - first).max()) + 1):
-            most = np.maximum(most, self.bound[np.minimum(first + more, last)])
-        return most
+        return self.bound[_bins_of_yaws(bins)].max(axis=0)
 
 
 def exact_consensus(
@@ -202,11 +196,21 @@ def _certify_bin(
     return int(max(most, best.supports[0])), int(effort)
 
 
+@lru_cache(maxsize=4)
+def _bins_of_yaws(count: int) -> IntArray:
+    """(B, ``count``) the bins of turn that each of that many equal steps of yaw from -pi upwards touches, some of them
+    more than once."""
+    ends = turn_of(np.linspace(-np.pi, np.pi, count + 1)) / BIN_TURN
+    first = np.floor(ends[:-1] + 1e-9).astype(int) % BINS
+    last = np.maximum(first, np.ceil(ends[1:] - 1e-9).astype(int) - 1)
+    last = np.where(ends[1:] < ends[:-1], BINS - 1, last)  # the bin that ends at turn 0
+    return np.minimum(first + np.arange(int((last - first).max()) + 1)[:, None], last)
+
+
 def _as_matrices(poses: FloatArray) -> FloatArray:
     """Level poses (C, 5) as (C, 3, 4)."""
-    matrices = np.zeros((len(poses), 3, 4))
+    matrices = level_poses(np.arctan2(poses[:, 1], poses[:, 0]), np.empty((len(poses), 3)))
     for pose, matrix in zip(poses, matrices, strict=True):
-        matrix[:, :3] = yaw_rotation(np.arctan2(pose[1], pose[0]))
         write_translation(pose, matrix[:, 3])
     return matrices
 

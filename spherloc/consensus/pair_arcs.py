@@ -139,16 +139,15 @@ def pair_arcs(aligned: AlignedProblem, bound_rad: FloatArray, watch: Watch | Non
     watch.expect(count * (count - 1) // 2)
     room = 2 * (count * (count - 1) // 2)
     # Memory that is never touched is never used, so room for the worst case costs nothing.
-    pairs, ends = np.empty((room, 2), np.int32), np.empty((room, 2))
-    used = _fill(aligned.bearings, aligned.points, bound_rad, pairs, ends, watch.board)
+    arcs = Arcs(np.empty((room, 2), np.int32), np.empty(room), np.empty(room))
+    used = _fill(aligned.bearings, aligned.points, bound_rad, arcs, watch.board)
     watch.check()
-    # Of one layout, however many there are: kernels are compiled for it.
-    return Arcs(pairs[:used], np.ascontiguousarray(ends[:used, 0]), np.ascontiguousarray(ends[:used, 1]))
+    return Arcs(*(values[:used] for values in arcs))
 
 
 @kernel()
 def turn_of_direction(c, s):
-    """Turn in [0, 4] of the direction (c, s) of any length."""
+    """Turn in [0, 4] of the direction (c, s) of any length; 4 by rounding alone."""
     quarter = s / (abs(c) + abs(s))
     if c < 0.0:
         return 2.0 - quarter
@@ -176,12 +175,13 @@ def yaws_between(lo, hi):
 
 
 @kernel()
-def _behind(a, b, c, u0, v0, u1, v1):
+def _behind(wave, u0, v0, u1, v1):
     """Whether a cos + b sin + c < 0 on all of the arc, shorter than half a circle, between two unit vectors.
 
-    They are (u0, v0) and (u1, v1). A wave exceeds the larger of its ends by at most its amplitude times sin^2 of half
-    the arc's width.
+    (a, b, c) is the ``wave`` (3,), (u0, v0) and (u1, v1) are the vectors. A wave exceeds the larger of its ends by at
+    most its amplitude times sin^2 of half the arc's width.
     """
+    a, b, c = wave
     most = max(a * u0 + b * v0, a * u1 + b * v1) + c
     if most >= 0.0:
         return False
@@ -190,15 +190,17 @@ def _behind(a, b, c, u0, v0, u1, v1):
 
 
 @kernel()
-def _fill(bearings, points, eps, pairs, ends, board):
-    """Write the arcs of ``pair_arcs`` to ``pairs`` (K, 2) and ``ends`` (K, 2), turns; returns how many.
+def _fill(bearings, points, eps, arcs, board):
+    """Write the arcs of ``pair_arcs`` to the ``Arcs`` ``arcs``, which have room for all; returns how many.
 
     ``bearings`` (M, 3), ``points`` (M, 3), m, ``eps`` (M,), rad. A watch's ``board`` counts the pairs and can end it.
     """
-    used = 0
+    used, (pairs, lo, hi) = 0, arcs
     chords, sines = np.empty(len(eps)), np.empty(len(eps))
     for i in range(len(eps)):
         chords[i], sines[i] = chord(eps[i]), np.sin(eps[i])
+    # All waves of a bearing before their arcs: what is decided by chance then waits for no other calculation.
+    waves, is_bounded = np.empty((len(eps), 4, 3)), np.empty(len(eps), np.bool_)
     for i in range(len(bearings)):
         if stopped(board):
             break
@@ -206,14 +208,14 @@ def _fill(bearings, points, eps, pairs, ends, board):
             sin_alpha, f, _, _, most_i, most_j, tau = pair_sinusoids(
                 bearings[i], bearings[j], points[i], points[j], chords[i], chords[j], sines[i], sines[j]
             )
-            if sin_alpha == 0.0:
-                pairs[used, 0], pairs[used, 1] = i, j
-                ends[used, 0], ends[used, 1] = 0.0, CIRCLE
-                used += 1
-                continue
+            is_bounded[j] = sin_alpha > 0.0
+            for k in range(3):
+                waves[j, 0, k], waves[j, 1, k] = f[k] - tau[k], f[k] + tau[k]
+                waves[j, 2, k], waves[j, 3, k] = most_i[k], most_j[k]
+        for j in range(i + 1, len(bearings)):
             # Outside the arc (out0, out1): f <= tau. Inside the arc [in0, in1]: -f <= tau.
-            a1, b1, c1 = f[0] - tau[0], f[1] - tau[1], f[2] - tau[2]
-            a2, b2, c2 = f[0] + tau[0], f[1] + tau[1], f[2] + tau[2]
+            a1, b1, c1 = waves[j, 0, 0], waves[j, 0, 1], waves[j, 0, 2]
+            a2, b2, c2 = waves[j, 1, 0], waves[j, 1, 1], waves[j, 1, 2]
             amp1, amp2 = a1 * a1 + b1 * b1, a2 * a2 + b2 * b2
             c1 -= ROUNDING * (np.sqrt(amp1) + abs(c1))
             c2 += ROUNDING * (np.sqrt(amp2) + abs(c2))
@@ -221,9 +223,9 @@ def _fill(bearings, points, eps, pairs, ends, board):
             if (root1 < 0.0 and c1 > 0.0) or (root2 < 0.0 and c2 < 0.0):
                 continue
             free1, free2 = root1 <= 0.0, root2 <= 0.0
-            if free1 and free2:
+            if not is_bounded[j] or (free1 and free2):
                 pairs[used, 0], pairs[used, 1] = i, j
-                ends[used, 0], ends[used, 1] = 0.0, CIRCLE
+                lo[used], hi[used] = 0.0, CIRCLE
                 used += 1
                 continue
             q1, q2 = np.sqrt(max(root1, 0.0)), np.sqrt(max(root2, 0.0))
@@ -231,13 +233,15 @@ def _fill(bearings, points, eps, pairs, ends, board):
             if free1:
                 out0u = out0v = out1u = out1v = 0.0
             else:
-                out0u, out0v = (-c1 * a1 + b1 * q1) / amp1, (-c1 * b1 - a1 * q1) / amp1
-                out1u, out1v = (-c1 * a1 - b1 * q1) / amp1, (-c1 * b1 + a1 * q1) / amp1
+                per = 1.0 / amp1
+                out0u, out0v = (-c1 * a1 + b1 * q1) * per, (-c1 * b1 - a1 * q1) * per
+                out1u, out1v = (-c1 * a1 - b1 * q1) * per, (-c1 * b1 + a1 * q1) * per
             if free2:
                 in0u = in0v = in1u = in1v = 0.0
             else:
-                in0u, in0v = (-c2 * a2 + b2 * q2) / amp2, (-c2 * b2 - a2 * q2) / amp2
-                in1u, in1v = (-c2 * a2 - b2 * q2) / amp2, (-c2 * b2 + a2 * q2) / amp2
+                per = 1.0 / amp2
+                in0u, in0v = (-c2 * a2 + b2 * q2) * per, (-c2 * b2 - a2 * q2) * per
+                in1u, in1v = (-c2 * a2 - b2 * q2) * per, (-c2 * b2 + a2 * q2) * per
             # Each arc as its first and second end, by growing yaw; the second is missing if its first vector is 0.
             first = (out1u, out1v, in1u, in1v)
             second = (in0u, in0v, out0u, out0v)
@@ -265,15 +269,15 @@ def _fill(bearings, points, eps, pairs, ends, board):
                     break
                 # sin of the width: a positive one below half a circle.
                 if u0 * v1 - v0 * u1 > 0.0 and (
-                    _behind(most_i[0], most_i[1], most_i[2], u0, v0, u1, v1)
-                    or _behind(most_j[0], most_j[1], most_j[2], u0, v0, u1, v1)
+                    _behind(waves[j, 2], u0, v0, u1, v1) or _behind(waves[j, 3], u0, v0, u1, v1)
                 ):
                     continue
-                lo, hi = turn_of_direction(u0, v0) % CIRCLE, turn_of_direction(u1, v1)
-                if hi < lo:
-                    hi = lo if lo - hi < ROUNDING else hi + CIRCLE
+                start, end = turn_of_direction(u0, v0), turn_of_direction(u1, v1)
+                start = start if start < CIRCLE else 0.0
+                if end < start:
+                    end = start if start - end < ROUNDING else end + CIRCLE
                 pairs[used, 0], pairs[used, 1] = i, j
-                ends[used, 0], ends[used, 1] = lo, hi
+                lo[used], hi[used] = start, end
                 used += 1
         board[DONE] += len(bearings) - 1 - i
     return used

@@ -29,7 +29,8 @@ from spherloc.watch import SELDOM, stopped
 EdgeArray = NDArray[np.uint16]
 
 BINS = 256
-"""Narrow beside the arcs of an error of some pixels, and few enough to cost nothing."""
+"""Narrow beside the arcs of an error of some pixels, and few enough to cost nothing. A power of 2."""
+LAST_BIN = BINS - 1
 BIN_TURN = CIRCLE / BINS
 """Turns of a bin."""
 EFFORT_LIMIT = 200_000
@@ -50,13 +51,19 @@ def sort_into_bins(
     touches. Nodes are copied, so that a bin is read from one place. A watch's ``board`` can end it, after which the
     edges are none.
     """
-    starts = np.zeros(BINS + 1, np.int64)
+    # How many arcs begin less how many have ended, at each bin of two rounds: the first and what goes beyond it.
+    change = np.zeros(2 * BINS, np.int64)
     for arc in range(len(lo)):
         if arc & SELDOM == 0 and stopped(board):
             return np.zeros(BINS + 1, np.int64), np.empty((0, 2), np.uint16)
         first, last = _bins(lo[arc], hi[arc])
-        for b in range(first, last + 1):
-            starts[b % BINS + 1] += 1
+        change[first] += 1
+        change[last + 1] -= 1
+    starts = np.zeros(BINS + 1, np.int64)
+    touching = np.int64(0)
+    for b in range(2 * BINS):
+        touching += change[b]
+        starts[(b & LAST_BIN) + 1] += touching
     for b in range(BINS):
         starts[b + 1] += starts[b]
     edges = np.empty((starts[BINS], 2), np.uint16)
@@ -67,9 +74,9 @@ def sort_into_bins(
             return np.zeros(BINS + 1, np.int64), np.empty((0, 2), np.uint16)
         first, last = _bins(lo[arc], hi[arc])
         for b in range(first, last + 1):
-            index = next_of_bin[b % BINS]
+            index = next_of_bin[b & LAST_BIN]
             edges[index, 0], edges[index, 1] = pairs[arc, 0], pairs[arc, 1]
-            next_of_bin[b % BINS] += 1
+            next_of_bin[b & LAST_BIN] += 1
     return starts, edges
 
 
@@ -91,7 +98,7 @@ def degree_bounds(
     """
     bound = np.empty(BINS, np.int32)
     fill_vector(bound, count)
-    degree, tally = np.empty(count, np.int64), np.empty(count + 1, np.int64)
+    degree, tally = np.empty(count, np.int32), np.empty(count + 1, np.int32)
     for b in range(BINS):
         if stopped(board):
             break
@@ -99,12 +106,15 @@ def degree_bounds(
         for index in range(starts[b], starts[b + 1]):
             degree[edges[index, 0]] += 1
             degree[edges[index, 1]] += 1
-        fill_vector(tally, 0)
+        # k nodes of degree k - 1 have k (k - 1) / 2 edges.
+        most = min(count, int(0.5 + np.sqrt(0.25 + 2.0 * (starts[b + 1] - starts[b]))) + 1)
+        for k in range(most + 1):
+            tally[k] = 0
         for node in range(count):
-            tally[min(degree[node], count)] += 1
+            tally[min(degree[node], most)] += 1
         # Nodes of degree k - 1 at least, for falling k, until there are k of them.
-        nodes = tally[count]
-        k = count
+        nodes = tally[most]
+        k = most
         while k > 1:
             nodes += tally[k - 1]
             if nodes >= k:

@@ -115,7 +115,12 @@ def default_options(estimator: str, problem: Problem) -> Any:
 
 
 def _default_options(kind: type, problem: Problem) -> Any:
-    return kind(**({} if problem.bound_px is None else {"bound_px": problem.bound_px}))
+    return _options_with(kind, problem.bound_px)
+
+
+@lru_cache
+def _options_with(kind: type, bound_px: float | None) -> Any:
+    return kind(**({} if bound_px is None else {"bound_px": bound_px}))
 
 
 def _changed(estimator: str, default: Any, changes: Mapping[str, Any]) -> Any:
@@ -124,7 +129,7 @@ def _changed(estimator: str, default: Any, changes: Mapping[str, Any]) -> Any:
     unknown = [key for key in changes if key not in known]
     if unknown:
         raise InputError(f"estimator {estimator} has no option {show(unknown[0])}; it has {', '.join(known)}.")
-    return replace(default, **changes)
+    return replace(default, **changes) if changes else default
 
 
 def check_positive(options: Any) -> None:

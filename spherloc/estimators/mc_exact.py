@@ -106,11 +106,10 @@ class ExactMaximumConsensus:
             guess = search_two_point(
                 aligned, bounds.pixels, seed, samples, SEED_CONFIDENCE, local_optimization=True, watch=clock.watch
             )
-            matches = pack_matches(aligned, bounds.noise_px)
-            start = first_pose(aligned, bounds, matches, guess)
+            start = first_pose(aligned, bounds, guess)
         rate = chance_rate(aligned.bearings, bounds.radians)
         with clock.stage("consensus"):
-            found = _search(aligned, bounds, rate, guess, matches, start, options, clock)
+            found = _search(aligned, bounds, rate, guess, start, options, clock)
         stage = _stage(aligned, bounds, start, found)
         stages: tuple[Stage, ...] = (stage,) if found.positions is None else (stage, found.positions)
         if found.pose is None:
@@ -124,7 +123,7 @@ class ExactMaximumConsensus:
                 *(pose(yaw_rotation(yaw), at) for yaw, at in _poses(guess)),
             ]
             refined, inliers, refinement = conclude(aligned, starts, bounds, options)
-        lower = _lower_bound(aligned, bounds, found.pose, refined, refinement.tilt_rad)
+        lower = _lower_bound(aligned, bounds, int(stage.support[0]), refined, refinement.tilt_rad)
         certificate = Certificate(max(found.upper, lower), lower, nfa(count, lower, rate))
         return Estimate((*stages, refinement), refined, inliers, certificate=certificate)
 
@@ -150,7 +149,6 @@ def _search(
     bounds: Bounds,
     rate: float,
     guess: TwoPointSearch,
-    matches: PackedMatches,
     start: tuple[FloatArray, int] | None,
     options: McExactOptions,
     clock: Clock,
@@ -179,6 +177,7 @@ def _search(
         if upper <= (1 if start is None else start[1]):
             return _Found(None if start is None else start[0], upper, pairs, effort)
     clock.watch.begin("search", 0.98)
+    matches = pack_matches(aligned, bounds.noise_px)
     found = search_positions(
         aligned,
         matches,
@@ -228,11 +227,8 @@ def _poses(guess: TwoPointSearch) -> list[tuple[float, FloatArray]]:
     return [(float(guess.yaws_rad[best]), guess.translations[best])]
 
 
-def _lower_bound(
-    aligned: AlignedProblem, bounds: Bounds, found: FloatArray, refined: FloatArray, tilt_rad: float
-) -> int:
-    """What a pose within the gravity bound surely explains: the best found one, or the refined one."""
-    lower = supported(aligned, found, bounds.noise_px)
+def _lower_bound(aligned: AlignedProblem, bounds: Bounds, lower: int, refined: FloatArray, tilt_rad: float) -> int:
+    """What a pose within the gravity bound surely explains: ``lower``, or as much as the refined one."""
     if tilt_rad <= aligned.gravity_bound_rad + 1e-12:
         lower = max(lower, supported(aligned, refined, bounds.noise_px))
     return lower
@@ -259,7 +255,7 @@ def _stage(
         effort=found.effort,
         finished=found.upper <= most,
         yaw_rad=yaw_of(poses[0][:, :3]) if poses else 0.0,
-        clique=aligned.index.astype(np.int32)[clique],
+        clique=aligned.index[clique].astype(np.int32),
         cam_from_map=aligned.unalign_poses(np.array(poses).reshape(-1, 3, 4)),
         support=supports,
     )
@@ -283,15 +279,14 @@ def supported(aligned: AlignedProblem, cam_from_map: FloatArray, bound_px: float
     return int(np.count_nonzero(residuals_px(aligned, cam_from_map) <= bound_px))
 
 
-def first_pose(
-    aligned: AlignedProblem, bounds: Bounds, matches: PackedMatches, guess: TwoPointSearch
-) -> tuple[FloatArray, int] | None:
+def first_pose(aligned: AlignedProblem, bounds: Bounds, guess: TwoPointSearch) -> tuple[FloatArray, int] | None:
     """A pose (3, 4) within the gravity bound and what it explains, from a search that took gravity as exact."""
     if not guess.found:
         return None
     best = np.argsort(-guess.support, kind="stable")[: FIRST_STARTS if aligned.gravity_bound_rad > 0.0 else 1]
     poses = list(level_poses(guess.yaws_rad[best], guess.translations[best]))
     if aligned.gravity_bound_rad > 0.0:
+        matches = pack_matches(aligned, bounds.noise_px)
         poses += [tilted for level in poses for tilted in _narrowed(aligned, bounds, matches, level)]
     counts = [supported(aligned, one, bounds.noise_px) for one in poses]
     most = int(np.argmax(counts))
