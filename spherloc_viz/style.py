@@ -68,6 +68,12 @@ DIM = 0.6
 """How far the colours of what is not selected move towards grey."""
 
 
+def blended(first: RGB, last: RGB, share: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Colours (K, 3) between two, by the share (K,) of the last one."""
+    start, end = np.array(first, np.float64), np.array(last, np.float64)
+    return np.round(start + share[:, None] * (end - start)).astype(np.uint8)
+
+
 def css(color: RGB) -> str:
     """The colour as "#rrggbb"."""
     return "#{:02x}{:02x}{:02x}".format(*color)

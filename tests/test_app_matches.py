@@ -127,6 +127,12 @@ def test_pages_filters_and_sorting(server: viser.ViserServer, page: Page, trace:
     ascending = press("match-sort:px")
     assert set(ascending[:20]) <= set((np.flatnonzero(trace.inlier_mask) + 10).tolist())
     assert press("match-sort:px")[0] != ascending[0] and "> 90°" in table._html.content
+    kept_count = np.count_nonzero(trace.inlier_mask)
+    assert (
+        f"agrees /{kept_count}</th>" in table._html.content
+        and f"With how many of {kept_count} inliers" in table._html.content
+    )
+    assert ("maximum clique of balls" in table._html.content) == (trace.estimator == "mc")
     for nonsense in ("match-sort:evil", "match-filter:evil", "match-page:-1", "match-page:x"):
         before = page.redraws
         press(nonsense)

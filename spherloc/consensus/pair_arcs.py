@@ -142,7 +142,7 @@ def pair_arcs(aligned: AlignedProblem, bound_rad: FloatArray, watch: Watch | Non
     arcs = Arcs(np.empty((room, 2), np.int32), np.empty(room), np.empty(room))
     used = _fill(aligned.bearings, aligned.points, bound_rad, arcs, watch.board)
     watch.check()
-    return Arcs(*(values[:used] for values in arcs))
+    return Arcs(arcs.pairs[:used], arcs.lo[:used], arcs.hi[:used])
 
 
 @kernel()

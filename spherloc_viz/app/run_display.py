@@ -18,7 +18,7 @@ from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.left_panels import LeftPanels
 from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
-from spherloc_viz.app.stage.canvas import Canvas
+from spherloc_viz.app.stage.canvas import Canvas, text_scale
 from spherloc_viz.app.text import diagnosis_html, hidden_html, status_html, summary_of
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import changes_of, set_theme
@@ -80,7 +80,7 @@ class RunDisplay:
         self.panels = LeftPanels(
             client.gui, touches, places.redraw, lambda chosen: select(chosen, False), places.scene_of, widths_px[0]
         )
-        self.card = MatchCard(client.gui, editable=movable)
+        self.card = MatchCard(client.gui, movable, text_scale(client.camera.image_width))
         moved = places.move or (lambda place: None)
         self.canvas = Canvas(client, self.controls.display, select, moved, sum(widths_px))
         self._shown: tuple[Run, bytes | None, Picture] | None = None
@@ -208,7 +208,7 @@ class RunDisplay:
             items=tuple(item for item in picture.scene if item.layer in layers),
             backdrop=mesh if "mesh" in layers else None,
             title=run.request.scene.scene,
-            note=f"{trace.estimator}, seed {trace.seed}{outcome}",
+            note=f"{picture.step.title} · {trace.estimator}, seed {trace.seed}{outcome}",
             recorded=recorded,
             dark=display.theme == "dark",
         )

@@ -63,7 +63,7 @@ class Status:
 def _line_html(sentence: str, wrong: bool = False, keep: str = "") -> str:
     """As high as two lines, so that widgets below do not move under the pointer. ``touch.css`` cuts a longer sentence,
     which is whole under a resting pointer; what went wrong is shown whole."""
-    button = f'<div style="float:right;padding:.2em .8em 0 0">{keep_html(keep)}</div>' if keep else ""
+    button = f'<div class="words" style="float:right;padding:.2em .8em 0 .4em">{keep_html(keep)}</div>' if keep else ""
     kind = "" if wrong else ' class="two-lines"'
     look = f'title="{escape(sentence)}" style="font-size:12px;min-height:3.4em"'
     return f"<div{kind} {look}>{button}{status_html(sentence, wrong)}</div>"

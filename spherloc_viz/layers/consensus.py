@@ -378,7 +378,6 @@ def _table(view: RunView, stage: ConsensusStage, states: list[FloatArray]) -> Ta
 
 BOX_EDGES = np.array([(a, a | 1 << axis) for axis in range(3) for a in range(8) if not a >> axis & 1])
 """(12, 2) corners that the edges of a box join; bit k of a corner's number says at which end of axis k it is."""
-FAINT, STRONG = np.array(style.UNDECIDED, float), np.array(style.CLIQUE, float)
 
 
 def position_plans(view: RunView, stage: PositionStage) -> list[Plan]:
@@ -435,7 +434,7 @@ def _camera_inside(boxes: FloatArray, centre: FloatArray) -> str:
 def _shades(bound: np.ndarray, support: int) -> ByteArray:
     """Colours (B, 3) of boxes: grey for the least bound that exceeds the best support, gold for the largest bound."""
     share = (bound - support) / max(1, int(bound.max()) - support)
-    return np.round(FAINT + share[:, None] * (STRONG - FAINT)).astype(np.uint8)
+    return style.blended(style.UNDECIDED, style.CLIQUE, share)
 
 
 def _box_edges(boxes: FloatArray, colors: ByteArray) -> Segments:

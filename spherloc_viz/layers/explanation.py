@@ -335,7 +335,9 @@ def part_in_stages(trace: Trace, number: int) -> tuple[str, ...]:
 
 
 def _lost_at(trace: Trace, number: int) -> str:
-    """The first stage in which the correspondence had no part, in a sentence; empty if it had a part in all."""
+    """The first stage in which the correspondence had no part or, if it had one in all, that it was lost after them: a
+    sentence, empty if no stage tells."""
+    passed = ""
     for stage in trace.stages:
         if isinstance(stage, YawStage) and not _members(stage.pairs, stage.clique, number):
             return "It was lost at the yaw arcs: none of its arcs is in the maximum clique."
@@ -345,7 +347,16 @@ def _lost_at(trace: Trace, number: int) -> str:
             return "It is not in the largest set that agrees."
         if isinstance(stage, RansacStage) and not stage.inlier_masks[:, number].any():
             return "None of RANSAC's best poses so far explained it."
-    return ""
+        passed = _PASSED.get(type(stage), passed)
+    return f"{passed}, but the refined pose does not explain it." if passed else ""
+
+
+_PASSED = {
+    TranslationStage: "It was not lost before the refinement: balls of it are in the maximum clique",
+    ConsensusStage: "It was not lost before the refinement: it is in the largest set that agrees",
+    RansacStage: "One of RANSAC's best poses so far explained it",
+}
+"""What is said of a correspondence that had a part in a stage of this type, the last one counting."""
 
 
 def _members(pairs: IndexArray, clique: IndexArray, number: int) -> int:

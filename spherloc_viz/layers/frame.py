@@ -165,6 +165,11 @@ class RunView:
         out[indices.ravel()] = True
         return out
 
+    def shares(self, indices: np.ndarray) -> FloatArray:
+        """(N,) how often each correspondence is among these indices, of any shape, as a share of the largest number."""
+        counts = np.bincount(indices.ravel(), minlength=len(self.points))
+        return counts / max(1, counts.max(initial=0))
+
     def position(self, cam_from_map: FloatArray) -> str:
         """Camera position of an aligned pose in the problem's own map frame, as text."""
         return self.place(camera_centre(cam_from_map))

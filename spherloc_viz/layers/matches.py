@@ -42,6 +42,8 @@ class MatchColumns:
     """Number of inliers of the run with which pairs were computed."""
     clique: BoolArray | None
     """(N,) members of the maximum clique: matches, or those of its balls; None if the run looked for no clique."""
+    of_balls: bool
+    """Whether it is one of balls."""
 
 
 Filter = Callable[[MatchColumns], BoolArray]
@@ -88,7 +90,8 @@ def match_rows(trace: Trace) -> MatchColumns:
     px = nothing if known.estimate is None else known.estimate.px
     deg = nothing if known.estimate is None else np.degrees(known.estimate.rad)
     agree, partners = _agreeing(trace)
-    return MatchColumns(known.kept, known.right, px, deg, agree, partners, _in_clique(trace))
+    of_balls = trace.stage(TranslationStage) is not None
+    return MatchColumns(known.kept, known.right, px, deg, agree, partners, _in_clique(trace), of_balls)
 
 
 def _in_clique(trace: Trace) -> BoolArray | None:

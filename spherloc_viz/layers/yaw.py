@@ -413,7 +413,7 @@ def _so_far(counts: np.ndarray, places: IntArray) -> str:
 def _clique(view: RunView, arcs: StageArcs) -> Frame:
     stage, drawn = arcs.stage, arcs.with_clique()
     turned, count = view.standing(yaw_rotation(stage.yaw_rad)), len(arcs)
-    note = stage.rule
+    note = f"The more of its arcs are in the clique, the more gold a match is. {stage.rule}".strip()
     if len(drawn) < count:
         note += f" An even sample of {len(drawn)} of {count:,} arcs is drawn, half of them from the clique."
     interval = np.degrees(stage.best_rad[1] - stage.best_rad[0])
@@ -425,13 +425,13 @@ def _clique(view: RunView, arcs: StageArcs) -> Frame:
         f"{interval:.2g}°.",
         "max over θ of Σ 1(|f(θ)| ≤ τ)   (Eq. 34, 37)",
         turned,
-        view.colors(style.UNDECIDED, (view.mask(stage.pairs[stage.clique]), style.CLIQUE)),
+        style.blended(style.UNDECIDED, style.CLIQUE, view.shares(stage.pairs[stage.clique])),
         view.no_matches(),
         note=note,
         items=(
             *items,
             ring.spoke("ring/estimate", view, view.middle, stage.yaw_rad, style.ESTIMATE),
-            ring.name("ring/name", view, stage.yaw_rad, "maximum clique"),
+            ring.name("ring/name", view, stage.yaw_rad, "maximum clique of arcs"),
             ring.name("ring/ring", view, stage.yaw_rad + np.pi, "yaw ring"),
         ),
     )

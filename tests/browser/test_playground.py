@@ -182,6 +182,15 @@ def test_the_introduction_is_shown_once_and_can_be_skipped(browser: Browser, add
     window.get_by_role("button", name="Show the introduction again").click()
     expect(window).to_have_count(0)
     expect(card).to_contain_text("1 of 4")
+    tab.page.set_viewport_size({"width": 390, "height": 844})
+    canvas = tab.page.locator("canvas").first
+
+    def shares_a_phone() -> bool:
+        """The canvas takes what is above the card."""
+        above, below = canvas.bounding_box(), card.bounding_box()
+        return bool(above and below) and 0 <= below["y"] - above["y"] - above["height"] < 40 and above["height"] > 420
+
+    tab.until(shares_a_phone, "the canvas of a phone ends above the card")
     tab.page.keyboard.press("Escape")
     expect(card).to_have_count(0)
     tab.expect_quiet(address)

@@ -123,6 +123,13 @@ def test_slider_stages_buttons_and_keys_step(tab: Playground, address: str) -> N
     tab.slide("Timeline", "End")
     expect(tab.step).to_have_value(at(title="Outcome"))
     tab.until(lambda: tab.drawn() == outcome, "the outcome is drawn as before")
+
+    # Another problem is read from its beginning, though the step has the same name.
+    tab.page.locator(".step-title").evaluate(SCROLL_PAST)
+    expect(tab.page.locator(".step-title")).not_to_be_in_viewport()
+    tab.choose("Preset", "Tilted car")
+    expect(tab.page.locator(".step-title")).to_be_in_viewport()
+    expect(tab.step).to_have_value(at(title="Outcome"))
     tab.expect_quiet(address)
 
 

@@ -74,16 +74,16 @@ class MatchCard:
     It lies over the canvas, so the longer parts are folded until the user opens them.
     """
 
-    def __init__(self, gui: viser.GuiApi, editable: bool = True) -> None:
-        """``editable`` says whether the page may change matches."""
-        self._editable = editable
+    def __init__(self, gui: viser.GuiApi, editable: bool = True, text_scale: float = 1.0) -> None:
+        """``editable`` says whether the page may change matches; ``text_scale`` is the factor of the text size."""
+        self._editable, self._width_px = editable, WIDTH_PX * text_scale
         self._panel = gui.add_panel(visible=False)
         with self._panel.add_tab("Selection"):
             self._html = gui.add_html("")
             self._more = gui.add_folder("Numbers and pairs", expand_by_default=False)
             with self._more:
                 self._details = gui.add_html("")
-        self._panel.float(x=MARGIN_PX, y=MARGIN_PX, width=WIDTH_PX)
+        self._panel.float(x=MARGIN_PX, y=MARGIN_PX, width=self._width_px)
         self._drawn: tuple | None = None
         self._right = False
 
@@ -119,7 +119,7 @@ class MatchCard:
             return
         if right != self._right:
             self._right = right
-            self._panel.float(x=-MARGIN_PX if right else MARGIN_PX, y=MARGIN_PX, width=WIDTH_PX)
+            self._panel.float(x=-MARGIN_PX if right else MARGIN_PX, y=MARGIN_PX, width=self._width_px)
         self._drawn = drawn
         if hidden:
             html, details = untold_html(trace, selected, kept, self._editable), ""

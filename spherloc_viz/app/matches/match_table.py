@@ -15,7 +15,16 @@ from spherloc_viz import style
 from spherloc_viz.app.text import DIM, WITHHELD, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import update_widget
-from spherloc_viz.layers.matches import FILTERS, SORTS, MatchColumns, match_rows, offered, order, reference_votes
+from spherloc_viz.layers.matches import (
+    FILTERS,
+    IN_CLIQUE,
+    SORTS,
+    MatchColumns,
+    match_rows,
+    offered,
+    order,
+    reference_votes,
+)
 
 MAX_REFERENCES = 8
 
@@ -59,7 +68,7 @@ COLUMNS = (
     ("truth", "truth", "Whether it truly is one"),
     ("px", "px", "Reprojection error at the estimated pose, px; there is none more than 90° from its bearing"),
     ("deg", "deg", "Angle between its bearing and its point at the estimated pose, degrees"),
-    ("agrees", "agrees", "With how many inliers it makes a pair that agrees at the estimated yaw"),
+    ("agrees", "agrees", "With how many of {} it makes a pair that agrees at the estimated yaw"),
 )
 """Name, heading and hint of each column."""
 
@@ -148,7 +157,7 @@ def table_html(rows: MatchColumns, listed: IntArray, look: TableLook, selected: 
     body = "".join(_row(rows, int(k), int(k) in selected, int(kept[k])) for k in shown)
     table = (
         '<table style="border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums;margin-top:.3em">'
-        f"<tr>{_headings(look)}</tr>{body}</table>"
+        f"<tr>{_headings(rows, look)}</tr>{body}</table>"
     )
     return box(_filters(rows, look) + table + _pages(rows, listed, look), "font-size:12.5px")
 
@@ -157,17 +166,22 @@ def _filters(rows: MatchColumns, look: TableLook) -> str:
     chips = []
     for name in offered(rows):
         count = np.count_nonzero(FILTERS[name](rows))
-        chips.append(chip(f"{name} {count:,}", f"match-filter:{name}", name == look.shown))
+        of_balls = " of balls" if name == IN_CLIQUE and rows.of_balls else ""
+        chips.append(chip(f"{name}{of_balls} {count:,}", f"match-filter:{name}", name == look.shown))
     return "".join(chips)
 
 
-def _headings(look: TableLook) -> str:
+def _headings(rows: MatchColumns, look: TableLook) -> str:
     cells = []
+    is_sample = rows.partners < np.count_nonzero(rows.kept)
+    asked = f"{rows.partners} inliers, an even sample," if is_sample else f"{rows.partners} inliers"
     for place, (name, heading, hint) in enumerate(COLUMNS):
+        if name == "agrees" and rows.partners:
+            heading = f"agrees /{rows.partners}"
         arrow = "" if name != look.by else " ▾" if look.down else " ▴"
         align = "left" if place < 3 else "right"
         cells.append(
-            f'<th data-touch="match-sort:{name}" role="button" tabindex="0" title="{escape(hint)}" '
+            f'<th data-touch="match-sort:{name}" role="button" tabindex="0" title="{escape(hint.format(asked))}" '
             f'style="text-align:{align};font-weight:600;padding:.15em .3em;white-space:nowrap">{heading}{arrow}</th>'
         )
     return "".join(cells)

@@ -109,7 +109,7 @@ def _bound(histogram: Histogram, x: Scale) -> list[str]:
     look = shapes.stroke(style.ESTIMATE, 1.5, ' stroke-dasharray="4 3"')
     parts.append(shapes.line(middle, TOP_PX - 4, middle, FOOT_PX, look))
     half = 0.5 * shapes.text_width_px(words)
-    return [*parts, shapes.text(min(max(middle, 60.0 + half), WIDTH_PX - half), 11.0, words, "middle")]
+    return [*parts, shapes.text(min(max(middle, 70.0 + half), WIDTH_PX - half), 11.0, words, "middle")]
 
 
 def history_svg(history: BestHistory) -> str:

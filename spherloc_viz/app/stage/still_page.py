@@ -96,10 +96,11 @@ def scene_script(still: Still) -> str:
 
 def _embed(page: str, still: Still) -> str:
     """The page with its title and legend, which lie over the canvas."""
-    color = "#e8e8ea" if still.dark else "#1a1b1e"
+    color, ground = ("#e8e8ea", "rgba(20,22,26,.8)") if still.dark else ("#1a1b1e", "rgba(255,255,255,.85)")
     # At the bottom, since viser's own notifications appear at the top.
-    where = "position:fixed;left:16px;right:16px;bottom:12px;z-index:10;pointer-events:none"
-    place = f"{where};font-family:system-ui,sans-serif;font-size:13px;color:{color}"
+    where = "position:fixed;left:12px;max-width:calc(100% - 24px);bottom:12px;z-index:10;pointer-events:none"
+    face = f"font-family:system-ui,sans-serif;font-size:13px;color:{color};background:{ground}"
+    place = f"{where};{face};box-sizing:border-box;padding:.6em .9em;border-radius:.5em"
     dot = "display:inline-block;width:.75em;height:.75em;border-radius:50%;margin-right:.4em"
     legend = "".join(
         f'<span style="margin-right:1.1em;white-space:nowrap"><span style="{dot};background:{style.css(paint)}"></span>'

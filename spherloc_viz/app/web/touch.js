@@ -1,10 +1,10 @@
 // Tells the server what a person presses in the HTML and SVG that it sent: elements with data-touch="ACTION:ARGUMENT".
-// With data-drag a drag across the element is told too; data-copy="TEXT" puts TEXT on the clipboard, or the page's address if TEXT is empty. And it tells which
-// elements with data-view="NAME" are to be seen, so that what stands on a hidden tab need not be drawn. A key presses the
-// element with data-key="KEY". Links within an element are followed, and do not press it. An element that gets another
-// data-reveal="NAME" is scrolled to, also while what stands above it grows, until a person scrolls or presses. What a
-// new link with data-fetch leads to is downloaded. When another step comes, a panel that was scrolled past its title
-// shows its beginning.
+// With data-drag a drag across the element is told too; data-copy="TEXT" puts TEXT on the clipboard, or the page's address
+// if TEXT is empty. And it tells which elements with data-view="NAME" are to be seen, so that what stands on a hidden tab
+// need not be drawn. A key presses the element with data-key="KEY". Links within an element are followed, and do not press
+// it. An element that gets another data-reveal="NAME" is scrolled to, also while what stands above it grows, until a person
+// scrolls or presses. What a new link with data-fetch leads to is downloaded. When another step or problem comes, a panel
+// that was scrolled past its title shows its beginning.
 (() => {
   const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150, FOLDED_LOOKS = 8;
   const REVEAL_MS = 3000, COPIED_MS = 5000;
@@ -81,8 +81,14 @@
     if (element && Date.now() < revealUntil) element.scrollIntoView({ block: "nearest" });
   }
 
+  function valueOf(name) {
+    const label = [...document.querySelectorAll("label[for]")].find((one) => one.textContent === name);
+    return document.getElementById(label?.htmlFor)?.value ?? "";
+  }
+
   function showStep() {
-    const title = seenElements(".step-title").find((one) => !one.closest(".captions")), words = title?.textContent ?? titled;
+    const title = seenElements(".step-title").find((one) => !one.closest(".captions"));
+    const words = title ? [title.textContent, ...["Preset", "Scene", "Query"].map(valueOf)].join("\n") : titled;
     if (words === titled || document.querySelector('input[aria-expanded="true"]')) return; // a list that is open stays
     for (let box = title.parentElement; titled !== null && box; box = box.parentElement)
       if (title.getBoundingClientRect().top < box.getBoundingClientRect().top) box.scrollTop = 0;
