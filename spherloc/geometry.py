@@ -71,9 +71,9 @@ def tangent_basis(directions: FloatArray) -> FloatArray:
 
 
 def pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """[R | t] (3, 4)."""
+    """[R | t] (3, 4) of a rotation (3, 3) and a translation (3,) or (3, 1)."""
     matrix = np.empty((3, 4))
-    matrix[:, :3], matrix[:, 3] = rotation, translation
+    matrix[:, :3], matrix[:, 3] = rotation, np.reshape(translation, 3)
     return matrix
 
 

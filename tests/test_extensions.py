@@ -9,20 +9,7 @@ import pytest
 from spherloc.registry import KINDS, RANSAC
 from spherloc.warm_up import warm_up
 from tests.installed import install, python, spherloc_each
-
-SCENE = """
-kind = "synthetic"
-name = "tiny"
-[camera]
-model = "equirectangular"
-width = 1024
-height = 512
-[simulation]
-correspondences = 30
-outlier_rate = 0.25
-noise_px = 0.5
-seed = 1
-"""
+from tests.tiny_scene import write_tiny_scene
 
 ESTIMATORS = '''
 """Estimators that work, that fail, and that return what nobody knows; and layers that do so."""
@@ -361,7 +348,7 @@ print(json.dumps({
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with scenes, and with what pip would have installed: a package, and another with one of its names."""
     folder = tmp_path_factory.mktemp("extensions")
-    (folder / "tiny.toml").write_text(SCENE)
+    write_tiny_scene(folder)
     for kind in POINTS["spherloc.datasets"]:
         (folder / f"{kind}.toml").write_text(f'kind = "{kind}"\n')
     (folder / "refuse.cal").write_text("# refuse\n\x00")
@@ -499,7 +486,7 @@ def test_the_page_the_painter_and_the_recorder_go_on(place: Path) -> None:
         "stage-crash": "The stage crash cannot be drawn by the layer of odd-pack (KeyError: 'plans').",
         "late-1": "The stage late cannot be drawn by the layer of odd-pack (AttributeError: ",
         "stage-keys": "the key 'outcome-1' of a plan does not begin with 'keys'",
-        "colors-1": "colors of the frame is float64 of shape (3, 3), not an array of uint8 of shape (30, 3)",
+        "colors-1": "colors of the frame is float64 of shape (3, 3), not an array of uint8 of shape (20, 3)",
         "item-1": "positions of the primitive odd is float64 of shape (3, 2), not an array of numbers of shape (N, 3)",
         "stage-listed": "plans() gives [1, 2], no list of Plan",
         "stage-number": "The layer 'number' of the extension odd-pack is 3, no Layer with title and plans",

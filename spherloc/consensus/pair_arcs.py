@@ -199,7 +199,7 @@ def _fill(bearings, points, eps, arcs, board):
     chords, sines = np.empty(len(eps)), np.empty(len(eps))
     for i in range(len(eps)):
         chords[i], sines[i] = chord(eps[i]), np.sin(eps[i])
-    # All waves of a bearing before their arcs: what is decided by chance then waits for no other calculation.
+    # All waves of a bearing before their arcs: branches that cannot be predicted then do not wait for the waves.
     waves, is_bounded = np.empty((len(eps), 4, 3)), np.empty(len(eps), np.bool_)
     for i in range(len(bearings)):
         if stopped(board):

@@ -100,14 +100,17 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
     if explained < inliers:
         bound = f"{view.bounds.noise_px:.3g} px"
         caption += f" within {bound} and what the error of gravity may add, {explained} of them within {bound}"
-    caption += f"{proven}. The pose, found in {total:.1f} ms, "
     if metrics.rotation_error_deg is None or metrics.translation_error_m is None:
-        caption += "has no known truth to compare with: the share of agreeing matches is all there is to judge it by."
+        caption += f", found in {total:.1f} ms{proven}. "
+        caption += "The truth is unknown, so the share of agreeing matches is all there is to judge it by."
     else:
         verdict = "a success" if metrics.success else "a failure"
         angle, length = angle_text(metrics.rotation_error_deg), view.length(metrics.translation_error_m)
         limit = view.length(SUCCESS_M)
-        caption += f"is {angle} and {length} off the truth: {verdict} by the limits of 1° and {limit}."
+        caption += (
+            f"{proven}. The pose, found in {total:.1f} ms, is {angle} and {length} off the truth: {verdict} by the "
+        )
+        caption += f"limits of 1° and {limit}."
     return Frame(
         caption,
         "success: error < 1° and < 0.1 m   (Sec. VI-A)",

@@ -92,7 +92,7 @@ RECIPES = (
     _Recipe(
         "Tilted car",
         "Roll and pitch are off by 1.4° and the refinement is told to believe them, so the pose is off as well: set "
-        "Gravity sd to what the problem states, and it mends both.",
+        "Gravity sd, under Refinement, to what the problem states, and it mends both.",
         "mei_outliers_80",
         1,
         Variation(outlier_rate=0.5, gravity_error_deg=1.0),

@@ -75,7 +75,8 @@ def graph_note(graph: Graph, edges: Edges) -> str:
         return f"One {nodes.name}: no edge yet, and a matrix of one cell. {press}"
     said = []
     if shown < graph.count:
-        said.append(f"{shown:,} of {graph.count:,} {_many(nodes.name)} are drawn, evenly from clique and rest.")
+        sample = "evenly from clique and others, half from the clique where it has so many"
+        said.append(f"{shown:,} of {graph.count:,} {_many(nodes.name)} are drawn: {sample}.")
     if drawn < edges.total:
         said.append(f"{drawn:,} of the {edges.total:,} edges between them are drawn, evenly.")
     elif edges.total:
