@@ -61,6 +61,7 @@
   function followStep() {
     const wanted = document.querySelector("[data-front]")?.dataset.front ?? "", views = (seen ?? "").split(",");
     if (!wanted || wanted === front || seen === null) return;
+    if (front !== "" && seen === "") return; // no view is to be seen, as while one is drawn anew: nobody has left it
     const follows = (front === "" || views.includes(front)) && linkedTab() === asked;
     if (follows && !openTab(wanted)) return;
     front = wanted;
