@@ -55,7 +55,8 @@ COORDINATE_ROUNDING = 4e-16
 SCALE_SHARE = 0.9
 """Share of the points that the scale looks at: a few far away must not make the cube large."""
 
-Q, Q_NORM, BEARING, JACOBIAN, BOUND_PX, PX_PER_RAD, BOUND_RAD, SINE, COSINE, WIDTH = 0, 3, 4, 7, 13, 14, 15, 16, 17, 18
+Q, Q_NORM, BEARING, LEVEL, SINE, COSINE, LEVEL_COSINE, BOUND_RAD = 0, 3, 4, 7, 8, 9, 10, 11
+JACOBIAN, BOUND_PX, PX_PER_RAD, WIDTH = 12, 18, 19, 20
 """Columns of ``PackedMatches.rows``; q, bearing and pixel Jacobian are 3, 3 and 6 columns."""
 S, C, HALF_S, HALF_C, HALF_C_NORM, HALF_C_FLAT, ANGLES, HALF_ANGLES, CELL_SIZE = 0, 1, 4, 5, 8, 9, 10, 13, 16
 """Where the numbers of a cell are in an array (CELL_SIZE,), see ``place_cell``; c and the angles are 3 numbers each."""
@@ -65,8 +66,8 @@ class PackedMatches(NamedTuple):
     """What the search looks at, M correspondences."""
 
     rows: FloatArray
-    """(M, WIDTH): q, |q|, bearing, W by rows, tau (px), |W| (px/rad), the angle that tau allows, its sine, its cosine.
-    """
+    """(M, WIDTH): q, |q|, bearing v, its horizontal length l, sine and cosine of the angle that tau allows, l times the
+    cosine of asin(sine / l), that angle, W by rows, tau (px), |W| (px/rad)."""
     rounding: float
     """What coordinates q may be off by rounding."""
     least_cosine: float
@@ -95,7 +96,9 @@ def pack_matches(aligned: AlignedProblem, bound_px: float) -> PackedMatches:
     rows[:, BOUND_PX] = bound_px
     rows[:, PX_PER_RAD] = aligned.pixels_per_radian
     angle = np.arcsin(np.minimum(1.0, bound_px * aligned.radians_per_pixel)) + SLACK
-    rows[:, BOUND_RAD], rows[:, SINE], rows[:, COSINE] = angle, np.sin(angle), np.cos(angle)
+    level, sine = np.hypot(aligned.bearings[:, 0], aligned.bearings[:, 2]), np.sin(angle)
+    rows[:, BOUND_RAD], rows[:, LEVEL], rows[:, SINE], rows[:, COSINE] = angle, level, sine, np.cos(angle)
+    rows[:, LEVEL_COSINE] = np.sqrt(np.maximum(level - sine, 0.0) * (level + sine))
     gamma = aligned.gravity_bound_rad
     return PackedMatches(
         rows=rows,

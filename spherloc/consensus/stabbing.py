@@ -29,6 +29,8 @@ from spherloc.consensus.pose_cells import (
     HALF_C_FLAT,
     HALF_C_NORM,
     HALF_S,
+    LEVEL,
+    LEVEL_COSINE,
     Q_NORM,
     SINE,
     SLACK,
@@ -94,6 +96,7 @@ def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
     psi = min(np.sqrt(half_a * half_a + half_tilt_c * half_tilt_c), matches.widest_turn + abs(a) + abs(c))
     cos_psi, sin_psi = np.cos(psi), np.sin(psi)
     half_y = cell[HALF_C + 1]
+    upright = a == 0.0 and c == 0.0 and psi == 0.0
     used, free = 0, 0
     near, far = 0.0, 0.0
     starts, ends = scratch.starts, scratch.ends
@@ -110,13 +113,13 @@ def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
         delta_flat = half_flat + more
         delta_y = half_y + more
         distance = max(np.sqrt(flat2 + y * y), half_c + more)
-        # v' = T^T v
-        b0, b1, b2 = row[BEARING], row[BEARING + 1], row[BEARING + 2]
-        along_a = ca * b1 + sa * b2
-        vx, vy, vz = cc * b0 + sc * along_a, cc * along_a - sc * b0, ca * b2 - sa * b1
-        level = np.sqrt(vx * vx + vz * vz)
-        sin_e = row[SINE] * cos_psi + row[COSINE] * sin_psi
-        cos_e = row[COSINE] * cos_psi - row[SINE] * sin_psi
+        vx, vy, vz, level = row[BEARING], row[BEARING + 1], row[BEARING + 2], row[LEVEL]
+        sin_e, cos_e = row[SINE], row[COSINE]
+        if not upright:  # v' = T^T v
+            along_a = ca * vy + sa * vz
+            vx, vy, vz = cc * vx + sc * along_a, cc * along_a - sc * vx, ca * vz - sa * vy
+            level = np.sqrt(vx * vx + vz * vz)
+            sin_e, cos_e = sin_e * cos_psi + cos_e * sin_psi, cos_e * cos_psi - sin_e * sin_psi
         pole = True
         if cos_e > 0.0:
             low, high = max(flat - delta_flat, 0.0), flat + delta_flat
@@ -136,8 +139,10 @@ def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
             starts[used], ends[used] = 0.0, EVERYWHERE
             free += 1
         else:
-            sin1, sin2 = delta_flat / flat, min(sin_e / level, 1.0)
-            cos1, cos2 = np.sqrt(1.0 - sin1 * sin1), np.sqrt(1.0 - sin2 * sin2)
+            # Sines times flat and level, of which a direction does not depend.
+            sin1, sin2 = delta_flat, min(sin_e, level)
+            cos1 = np.sqrt((flat - delta_flat) * (flat + delta_flat))
+            cos2 = row[LEVEL_COSINE] if upright else np.sqrt((level - sin2) * (level + sin2))
             sin_half = sin1 * cos2 + cos1 * sin2
             cos_half = cos1 * cos2 - sin1 * sin2
             sin_half, cos_half = sin_half + SLACK * cos_half, cos_half - SLACK * sin_half

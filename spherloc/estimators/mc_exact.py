@@ -81,8 +81,8 @@ class McExactOptions(RefinementOptions):
 
 PAIR_EFFORT = 20_000_000
 """Words touched by the search over pairs for an ``effort`` of 1."""
-POSITION_EFFORT = 75_000_000
-"""Matches tested by the search over positions for an ``effort`` of 1."""
+POSITION_EFFORT, EACH_POSITION_EFFORT = 60_000_000, 1000
+"""Matches tested by the search over positions for an ``effort`` of 1: in all, or for each match if that is more."""
 MAX_EFFORT = 1 << 50
 """Months of work; more does not fit into the kernels' counters."""
 
@@ -182,7 +182,7 @@ def _search(
         aligned,
         matches,
         start,
-        int(min(options.effort * POSITION_EFFORT, MAX_EFFORT)),
+        int(min(options.effort * max(POSITION_EFFORT, EACH_POSITION_EFFORT * len(aligned.points)), MAX_EFFORT)),
         deadline,
         yaw_bound,
         clock.watch,
