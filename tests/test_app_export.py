@@ -18,7 +18,7 @@ from PIL import Image
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.estimators import estimate
 from spherloc_viz.app.panels import export_panel
-from spherloc_viz.app.panels.export_panel import CANVAS, ExportPanel, Shown, code_html, file_stem, on_canvas
+from spherloc_viz.app.panels.export_panel import CANVAS, ExportPanel, Shown, code_html, file_stem, picture_png
 from spherloc_viz.app.stage.still_page import Still, still_html
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
@@ -135,12 +135,24 @@ def test_file_names_are_plain(shown: Shown, title: str, stem: str) -> None:
     assert file_stem(replace(shown, title=title)) == stem
 
 
-def test_a_picture_lies_on_the_colour_of_the_page() -> None:
-    pixels = np.zeros((4, 6, 4), np.uint8)
-    pixels[1:3, 2:4] = (200, 40, 60, 255)
-    picture = np.array(Image.open(io.BytesIO(on_canvas(pixels, CANVAS[True]))))
-    assert picture.shape == (4, 6, 3) and np.all(picture[1:3, 2:4] == (200, 40, 60))
-    assert np.all(picture[0] == CANVAS[True])
+@pytest.mark.parametrize("title", ["Street", "", "τ − σ", "word " * 400, "x" * 400])
+def test_a_picture_lies_on_the_colour_of_the_page_above_its_words(title: str) -> None:
+    pixels = np.zeros((480, 640, 4), np.uint8)
+    pixels[100:300, 200:400] = (200, 40, 60, 255)
+    picture = np.array(Image.open(io.BytesIO(picture_png(pixels, title, "Outcome", dark=True))))
+    assert picture.shape[1:] == (640, 3) and 500 < len(picture) < 560
+    assert np.all(picture[100:300, 200:400] == (200, 40, 60)) and np.all(picture[:100] == CANVAS[True])
+    drawn = (picture[480:] > 100).any(axis=2)
+    assert drawn[len(drawn) // 2 :].any() and drawn[: len(drawn) // 2].any() == bool(title)
+    assert not drawn[:, -10:].any(), "a long title is cut"
+
+
+def test_words_below_a_picture_are_told_apart() -> None:
+    def below(note: str) -> bytes:
+        picture = Image.open(io.BytesIO(picture_png(np.zeros((480, 640, 4), np.uint8), "Street", note, dark=False)))
+        return np.array(picture)[480:].tobytes()
+
+    assert len({below(note) for note in ("Outcome", "Matches", "τ", "−")}) == 4, "a letter that the font lacks"
 
 
 def test_the_picture_is_what_the_browser_draws(page: ConnectedPage, shown: Shown) -> None:
@@ -161,7 +173,8 @@ def test_the_picture_is_what_the_browser_draws(page: ConnectedPage, shown: Shown
     assert "spherloc-small-street-40-mc.png" in press(panel, panel._picture)
     until(lambda: "spherloc-small-street-40-mc.png" in page.files)
     picture = np.array(Image.open(io.BytesIO(page.files["spherloc-small-street-40-mc.png"])))
-    assert np.all(picture[:, 60:] == (10, 200, 30)) and np.all(picture[:, :60] == CANVAS[True])
+    assert np.all(picture[:72, 60:] == (10, 200, 30)) and np.all(picture[:72, :60] == CANVAS[True])
+    assert len(picture) > 90, "scene and step stand below"
 
 
 def test_a_browser_that_draws_nothing_is_waited_for_in_vain(

@@ -15,6 +15,7 @@ from spherloc.errors import RecordingError
 from spherloc.estimators import default_options, estimate
 from spherloc_viz.app.catalog import Catalog, Run, RunRequest, SceneRequest
 from spherloc_viz.app.link import MANY, MAX_LETTERS, ONCE, Follower, PageView, link_of
+from spherloc_viz.app.matches.match_table import TableLook
 from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.review.opened import Opened
 from tests.tiny_scene import write_tiny_scene
@@ -59,6 +60,7 @@ def test_what_is_written_is_read_again(place: Place) -> None:
     viewpoint = (1.5, -2.25, 3.0, 0.0, 0.125, -1e-05, 45.0)
     request = RunRequest(scene, "ransac-2p", options)
     view = PageView("sample-3", (2, 4), "light", True, viewpoint, "Graph", compared=("mc", "ransac-2p"))
+    view = replace(view, table=TableLook("outliers", "px", down=True))
     found = place.follower.follow(place.link(request, view), place.now, VIEW)
     assert (found.request, found.view, found.remarks) == (request, view, ())
     assert place.follower.follow("", place.now, VIEW).remarks == ()
@@ -104,6 +106,8 @@ def test_a_scene_of_an_allowed_folder_is_opened_again(place: Place) -> None:
         ("view", "1,2,3,0,0,0,999", "view is"),
         ("theme", "pink", "theme is 'pink'; give dark or light."),
         ("tab", "Play", "tab is 'Play'; give Yaw, Graph, "),
+        ("table", "outliers,size", "table is 'outliers,size'; give a filter (all, "),
+        ("table", "wrong", "table is 'wrong'; give a filter"),
         ("compare", "mc,magic,mc", "the estimator 'magic' is unknown, so it is not compared."),
     ],
 )

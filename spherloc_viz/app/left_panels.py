@@ -75,7 +75,7 @@ class LeftPanels:
             self._lens = LensPanel(gui, touches, scene_of, changed)
         with _view(gui, views, "Matches"):
             gui.add_html(heading_html("Press a row: the match lights up everywhere", "match"))
-            self._matches = MatchTablePanel(gui, touches, changed)
+            self.matches = MatchTablePanel(gui, touches, changed)
         self._panel, self._width_px = steps, width_px
         steps.dock_left()
         views.dock_below(steps)
@@ -113,7 +113,7 @@ class LeftPanels:
             self._images.draw(run.trace, picture, selected, kept, hidden)
             self._lens.draw(run, hidden)
         if "Matches" in seen:
-            self._matches.draw(run.trace, selected, kept, hidden)
+            self.matches.draw(run.trace, selected, kept, hidden)
         summary, ending = ("", "") if hidden else (summary_html(run.trace), table_html(outcome))
         summary = offered + summary
         if self._opening == run.request.scene.scene:

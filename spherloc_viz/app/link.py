@@ -20,6 +20,7 @@ from spherloc.errors import InputError, SpherlocError, show
 from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem
 from spherloc_viz.app.catalog import Catalog, Run, RunRequest, SceneRequest
+from spherloc_viz.app.matches.match_table import TableLook, look_of
 from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.options import option_fields, typed, usable_estimators
@@ -40,7 +41,7 @@ LISTS = ("spoil", "mend", "hide")
 """Keys of ``EDITS``, in their order."""
 ONCE = (
     *("v", "run", "scene", "case", "place", "seed", "query", "camera", *LISTS, "estimator"),
-    *("step", "select", "view", "theme", "answers", "tab", "compare"),
+    *("step", "select", "view", "theme", "answers", "tab", "compare", "table"),
 )
 MANY = ("set", "option")
 
@@ -60,6 +61,8 @@ class PageView:
     tab: str = TABS[0]
     compared: tuple[str, ...] = ()
     """Names of the estimators that are compared on the run's problem."""
+    table: TableLook = TableLook()
+    """Filter and order of the table of matches."""
 
 
 def link_of(
@@ -95,6 +98,7 @@ def link_of(
         ("theme", view.theme if view.theme != THEMES[0] else None),
         ("answers", ANSWERS[1] if view.answers_hidden else None),
         ("compare", ",".join(view.compared)),
+        ("table", view.table.text()),
     ]
     text = urlencode([(key, value) for key, value in pairs if value])
     return text if len(text) <= MAX_LETTERS else ""
@@ -296,7 +300,13 @@ def _view(said: dict[str, Any], view: PageView, opened: Opened | None, remarks: 
         remarks.append(str(error))
     step = said.get("step", view.step if opened is None else "")
     tab = _one_of(said, "tab", TABS, remarks)
-    return PageView(step, selected, theme, hidden, viewpoint, tab, _compared(said.get("compare", ""), remarks))
+    table = TableLook()
+    try:
+        table = look_of(said.get("table", ""))
+    except InputError as error:
+        remarks.append(str(error))
+    compared = _compared(said.get("compare", ""), remarks)
+    return PageView(step, selected, theme, hidden, viewpoint, tab, compared, table)
 
 
 def _compared(text: str, remarks: list[str]) -> tuple[str, ...]:

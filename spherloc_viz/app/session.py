@@ -315,6 +315,7 @@ class Session:
             key = _step_key(self._run.trace, followed)
             remarks += followed.missing(key, kept)
             self._display.panels.steps.go(key)
+            self._display.panels.matches.look = followed.view.table
             compared = followed.view.compared
             self._display.panels.open_tab(followed.view.tab, COMPARE if compared else "")
             self._controls.compare.follow(self._run.trace, compared)
@@ -335,6 +336,7 @@ class Session:
             self._display.canvas.viewpoint(),
             self._display.panels.tab,
             () if run is None else self._controls.compare.compared(run.trace),
+            replace(self._display.panels.matches.look, page=0),
         )
 
     def _open_linked(self, file: str) -> Opened:

@@ -8,6 +8,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from spherloc.errors import InputError, show
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.types import BoolArray, IntArray
@@ -82,6 +83,25 @@ class TableLook:
     down: bool = False
     page: int = 0
 
+    def text(self) -> str:
+        """Filter and order as text for a link, such as "outliers,-px"; empty for those of a new page."""
+        same = replace(self, page=0) == TableLook()
+        return "" if same else f"{self.shown},{'-' if self.down else ''}{self.by}"
+
+
+def look_of(text: str) -> TableLook:
+    """The look of which ``text`` is the text. Raises ``InputError`` for an unknown filter or column."""
+    if not text:
+        return TableLook()
+    shown, _, by = text.partition(",")
+    column = by.removeprefix("-")
+    if shown not in FILTERS or column not in SORTS:
+        raise InputError(
+            f"table is {show(text)}; give a filter ({', '.join(FILTERS)}), a comma and a column "
+            f"({', '.join(SORTS)}), with a minus in front for descending order."
+        )
+    return TableLook(shown, column, by != column)
+
 
 class MatchTablePanel:
     """The table of one page."""
@@ -89,7 +109,8 @@ class MatchTablePanel:
     def __init__(self, gui: viser.GuiApi, touches: Touches, changed: Callable[[object], None]) -> None:
         self._html = gui.add_html("")
         self._changed = changed
-        self._look = TableLook()
+        self.look = TableLook()
+        """As chosen by a person or a link."""
         self._followed: tuple[int, ...] = ()
         self._drawn: tuple | None = None
         for action, handler in (
@@ -109,10 +130,10 @@ class MatchTablePanel:
             self._drawn = None
             update_widget(self._html, content=status_html(WITHHELD))
             return
-        drawn = (trace, selected, kept.tobytes(), self._look)
+        drawn = (trace, selected, kept.tobytes(), self.look)
         if self._drawn is not None and self._drawn[0] is trace and self._drawn[1:] == drawn[1:]:
             return
-        rows, look = match_rows(trace), self._look
+        rows, look = match_rows(trace), self.look
         look = look if look.shown in offered(rows) else replace(look, shown="all")
         listed = order(rows, look.shown, look.by, look.down)
         pages = max(1, -(-len(listed) // PAGE))
@@ -120,26 +141,26 @@ class MatchTablePanel:
         if selected != self._followed:
             self._followed = selected
             page = _page_of(listed, selected, page)
-        self._look = look = replace(look, page=page)
+        self.look = look = replace(look, page=page)
         self._drawn = (*drawn[:3], look)
         html = table_html(rows, listed, look, frozenset(selected), kept)
         update_widget(self._html, content=html)
 
     def _sort(self, touch: Touch) -> None:
         if touch.argument in SORTS:
-            down = not self._look.down if self._look.by == touch.argument else False
-            self._show(replace(self._look, by=touch.argument, down=down, page=0))
+            down = not self.look.down if self.look.by == touch.argument else False
+            self._show(replace(self.look, by=touch.argument, down=down, page=0))
 
     def _filter(self, touch: Touch) -> None:
         if touch.argument in FILTERS:
-            self._show(replace(self._look, shown=touch.argument, page=0))
+            self._show(replace(self.look, shown=touch.argument, page=0))
 
     def _turn(self, touch: Touch) -> None:
         if touch.argument.isdecimal():
-            self._show(replace(self._look, page=min(int(touch.argument), 10**6)))
+            self._show(replace(self.look, page=min(int(touch.argument), 10**6)))
 
     def _show(self, look: TableLook) -> None:
-        self._look = look
+        self.look = look
         self._changed(look)
 
 

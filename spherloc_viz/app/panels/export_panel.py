@@ -7,10 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import viser
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from spherloc.errors import InputError
 from spherloc.trace import Trace
@@ -36,6 +37,10 @@ LINK = box(
 """The page's script knows the address, see ``touch.js``."""
 CANVAS = {True: (20, 20, 20), False: (255, 255, 255)}
 """What the canvas has behind everything, by whether the page is dark."""
+INK = {True: ((235, 238, 242), (170, 178, 190)), False: ((25, 28, 32), (95, 102, 112))}
+"""Colours of the title and of the note below a picture."""
+MIN_TEXT_PX, TEXT_SHARE = 11.0, 0.96
+"""Least height of that text, and the share of the picture's width that it may take."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +73,7 @@ class ExportPanel:
         gui.add_html(heading_html("Send what you see, or repeat it elsewhere", "recording"))
         gui.add_html(LINK)
         buttons = (
-            ("Picture (PNG)", "The canvas as it is seen now.", self._picture),
+            ("Picture (PNG)", "The canvas as it is seen now, and below it what it shows.", self._picture),
             ("Scene (HTML)", "The canvas as a file that opens in any browser, with no network.", self._page),
             ("Recording (.rrd)", "The run with all of its steps, for a Rerun viewer.", self._recording),
         )
@@ -108,7 +113,7 @@ class ExportPanel:
             raise InputError(
                 "the browser gave no picture of the canvas; keep its tab in front and try again."
             ) from None
-        self._send(f"{file_stem(shown)}.png", on_canvas(pixels, CANVAS[shown.dark]))
+        self._send(f"{file_stem(shown)}.png", picture_png(pixels, shown.title, shown.note, shown.dark))
 
     def _page(self) -> None:
         shown = self._now()
@@ -148,13 +153,48 @@ class ExportPanel:
         self._status.visible = True
 
 
-def on_canvas(pixels: np.ndarray, color: tuple[int, int, int]) -> bytes:
-    """RGBA pixels (H, W, 4) on a colour, as a PNG."""
+def picture_png(pixels: np.ndarray, title: str, note: str, dark: bool) -> bytes:
+    """A canvas, RGBA pixels (H, W, 4), with two lines of text below it, as a PNG."""
     picture = Image.fromarray(pixels, "RGBA")
-    ground = Image.new("RGBA", picture.size, (*color, 255))
+    width, height = picture.size
+    lines = [_line(title, width, height / 32), _line(note, width, height / 42)]
+    pad = height // 60
+    ground = Image.new("RGBA", (width, height + sum(line.size_px for line in lines) + 3 * pad), (*CANVAS[dark], 255))
+    ground.alpha_composite(picture)
+    draw, top = ImageDraw.Draw(ground), height + pad
+    for line, color in zip(lines, INK[dark], strict=True):
+        draw.text((pad, top), line.text, color, line.font)
+        top += line.size_px + pad
     out = io.BytesIO()
-    Image.alpha_composite(ground, picture).convert("RGB").save(out, "PNG")
+    ground.convert("RGB").save(out, "PNG")
     return out.getvalue()
+
+
+@dataclass(frozen=True)
+class _Line:
+    text: str
+    font: Any
+    size_px: int
+
+
+def _font(size_px: float) -> Any:
+    """A font that knows Greek letters and signs of mathematics too."""
+    import matplotlib  # a tenth of a second, so only where it is needed
+
+    return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf"), size_px)
+
+
+def _line(text: str, width: int, size_px: float) -> _Line:
+    """Text on one line within a ``width``, px; smaller than ``size_px`` if it is long, and cut if that is too small."""
+    size = max(MIN_TEXT_PX, size_px)
+    font: Any = _font(size)
+    long = font.getlength(text) / (TEXT_SHARE * width)
+    if long > 1.0:
+        size = max(MIN_TEXT_PX, size / long)
+        font = _font(size)
+        while len(text) > 1 and font.getlength(text) > TEXT_SHARE * width:
+            text = text[: int(0.9 * len(text))].rstrip(" …") + "…"
+    return _Line(text, font, round(1.2 * size))
 
 
 def file_stem(shown: Shown) -> str:

@@ -407,4 +407,5 @@ def caption(trace: Trace, story: YawStory, arcs: PairArcs, bars: ArcBars) -> str
         rule = f"{rule} in this window shown: {counts}."
     judged = right_ones(trace)[1]
     colors = f"Green: both matches right {judged}; red: both wrong; faint red: one wrong."
-    return " ".join(filter(None, (story.note, arcs.rule, rule, colors)))
+    joined = "Violet lines join the two arcs of one pair." if (bars.chosen & (bars.count > 1)).any() else ""
+    return " ".join(filter(None, (story.note, arcs.rule, rule, colors, joined)))
