@@ -90,6 +90,12 @@ def test_a_match_a_ball_and_a_node_light_up_together(mc: Trace) -> None:
         style.css(style.SELECTED) in html
         and style.css(style.SELECTED) not in graph_html(graph, (), kept).split("<image")[1]
     )
+    overlaps, others = np.count_nonzero(graph.nodes.agrees[5]), len(graph.shown) - 1
+    member = " and is in the clique" if graph.nodes.clique > 5 else ""
+    named = f"the ball of matches {pair[0] + 1000} and {pair[1] + 1000} overlaps {overlaps} of the other {others}{member}"
+    assert named in html and "Selected" not in graph_html(graph, (), kept)
+    often = int(np.bincount(graph.nodes.matches.ravel()).argmax())
+    assert f"Selected, violet: {len(graph.nodes.lit((often,)))} balls." in graph_html(graph, (often,), kept)
     cell = (5.5 / len(graph.shown), 7.5 / len(graph.shown))
     assert cell_nodes(graph, *cell).tolist() == [5, 7]
     assert (

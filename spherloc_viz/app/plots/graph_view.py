@@ -28,6 +28,8 @@ MATRIX_PX = (212.0, 20.0, 186.0)
 FONT = ' style="font-size:13px"'
 MAX_EDGES = 450
 """Largest number of edges drawn between marked nodes, and of those between others."""
+MAX_TOLD = 2
+"""Largest number of selected nodes of which each is described."""
 MAX_LIT = 12
 """Largest number of selected nodes that are marked in the matrix."""
 
@@ -87,6 +89,24 @@ def graph_note(graph: Graph, edges: Edges) -> str:
         said.append("No two of them agree yet, so there is no edge.")
     said.append(f"The matrix has a row and a column for each of the {shown:,} nodes.")
     return " ".join([*_listed(graph), *said, press])
+
+
+def chosen_words(graph: Graph, lit: NDArray[np.int64], kept: NDArray[np.int64]) -> str:
+    """Which of the drawn nodes are selected, and what they agree with; empty without one. ``lit`` and ``kept`` are as
+    in ``graph_svg``."""
+    nodes, others = graph.nodes, int(np.count_nonzero(graph.shown)) - 1
+    if not len(lit):
+        return ""
+    if len(lit) > MAX_TOLD:
+        return f"Selected, violet: {len(lit)} {_many(nodes.name)}."
+    verb = "overlaps" if nodes.name == "ball" else "agrees with"
+    said = []
+    for k in lit.tolist():
+        numbers = " and ".join(map(str, kept[nodes.matches[k]].tolist()))
+        who = f"match {numbers}" if nodes.name == "match" else f"the {nodes.name} of matches {numbers}"
+        member = " and is in the clique" if graph.color == style.CLIQUE and graph.marked[k] else ""
+        said.append(f"{who} {verb} {np.count_nonzero(nodes.agrees[k] & graph.shown)} of the other {others}{member}")
+    return f"Selected, violet: {'; '.join(said)}."
 
 
 def _listed(graph: Graph) -> list[str]:
@@ -237,9 +257,13 @@ def graph_html(graph: Graph, selected: tuple[int, ...], kept: NDArray[np.int64])
     """Both drawings, with a description of what they show."""
     lit, edges = graph.nodes.lit(selected), edges_of(graph)
     title = f'<div style="font-weight:600;padding-bottom:.3em">Graph and matrix{help_html("graph")}</div>'
-    words = f'<div style="padding-top:.4em">{linked(graph.words)}</div>'
+    lit = lit[graph.shown[lit]]
+    chosen = chosen_words(graph, lit, kept)
+    words = "".join(
+        f'<div style="padding-top:.4em">{said}</div>' for said in (linked(graph.words), escape(chosen)) if said
+    )
     note = f'<div style="font-size:12px;opacity:.75;padding-top:.3em">{escape(graph_note(graph, edges))}</div>'
-    return box(title + graph_svg(graph, edges, lit[graph.shown[lit]], kept) + words + note)
+    return box(title + graph_svg(graph, edges, lit, kept) + words + note)
 
 
 def _waiting_html(begins: str) -> str:
