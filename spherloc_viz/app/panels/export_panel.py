@@ -171,7 +171,7 @@ def picture_png(pixels: np.ndarray, title: str, note: str, dark: bool) -> bytes:
 
 
 @dataclass(frozen=True)
-class _Line:
+class _TextLine:
     text: str
     font: Any
     size_px: int
@@ -184,7 +184,7 @@ def _font(size_px: float) -> Any:
     return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf"), size_px)
 
 
-def _line(text: str, width: int, size_px: float) -> _Line:
+def _line(text: str, width: int, size_px: float) -> _TextLine:
     """Text on one line within a ``width``, px; smaller than ``size_px`` if it is long, and cut if that is too small."""
     size = max(MIN_TEXT_PX, size_px)
     font: Any = _font(size)
@@ -194,7 +194,7 @@ def _line(text: str, width: int, size_px: float) -> _Line:
         font = _font(size)
         while len(text) > 1 and font.getlength(text) > TEXT_SHARE * width:
             text = text[: int(0.9 * len(text))].rstrip(" …") + "…"
-    return _Line(text, font, round(1.2 * size))
+    return _TextLine(text, font, round(1.2 * size))
 
 
 def file_stem(shown: Shown) -> str:
