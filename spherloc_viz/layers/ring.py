@@ -113,10 +113,14 @@ def spoke(
     return Segments(name, "yaw ring", ends[None], one_color(color, 1), 4.0)
 
 
-def name(path: str, view: RunView, yaw_rad: float, words: str) -> Label:
-    """A label outside the ring at a yaw, beyond the lines that end there."""
-    radius_m = view.sphere_m * (BEYOND if _hides_truth(view, [yaw_rad]) else END)
-    place = view.middle + radius_m * directions(np.array([yaw_rad]))[0]
+def name(path: str, view: RunView, yaw_rad: float, words: str, counts: np.ndarray | None = None) -> Label:
+    """A label outside the ring at a yaw: beyond the lines that end there, or right at the outline of ``counts`` (K,),
+    over all yaws."""
+    radius = BEYOND if _hides_truth(view, [yaw_rad]) else END
+    if counts is not None:
+        heights = by_degree(counts) / max(1, int(counts.max()))
+        radius = FOOT + HEIGHT * float(heights[int(np.degrees(wrap_angle(yaw_rad)) + 180.0) % DEGREES])
+    place = view.middle + view.sphere_m * radius * directions(np.array([yaw_rad]))[0]
     return Label(path, "yaw ring", place - np.array([0.0, 0.25 * view.sphere_m, 0.0]), words)
 
 
