@@ -92,7 +92,9 @@ def test_a_match_a_ball_and_a_node_light_up_together(mc: Trace) -> None:
     )
     overlaps, others = np.count_nonzero(graph.nodes.agrees[5]), len(graph.shown) - 1
     member = " and is in the clique" if graph.nodes.clique > 5 else ""
-    named = f"the ball of matches {pair[0] + 1000} and {pair[1] + 1000} overlaps {overlaps} of the other {others}{member}"
+    named = (
+        f"the ball of matches {pair[0] + 1000} and {pair[1] + 1000} overlaps {overlaps} of the other {others}{member}"
+    )
     assert named in html and "Selected" not in graph_html(graph, (), kept)
     often = int(np.bincount(graph.nodes.matches.ravel()).argmax())
     assert f"Selected, violet: {len(graph.nodes.lit((often,)))} balls." in graph_html(graph, (often,), kept)

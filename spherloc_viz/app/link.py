@@ -20,7 +20,7 @@ from spherloc.errors import InputError, SpherlocError, show
 from spherloc.estimators import default_options, options_type
 from spherloc.problem import Problem
 from spherloc_viz.app.catalog import Catalog, Run, RunRequest, SceneRequest
-from spherloc_viz.app.matches.match_table import TableLook, look_of
+from spherloc_viz.app.matches.match_table import NEW_TABLE, TableLook, look_of
 from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.options import option_fields, typed, usable_estimators
@@ -61,7 +61,7 @@ class PageView:
     tab: str = TABS[0]
     compared: tuple[str, ...] = ()
     """Names of the estimators that are compared on the run's problem."""
-    table: TableLook = TableLook()
+    table: TableLook = NEW_TABLE
     """Filter and order of the table of matches."""
 
 
@@ -300,7 +300,7 @@ def _view(said: dict[str, Any], view: PageView, opened: Opened | None, remarks: 
         remarks.append(str(error))
     step = said.get("step", view.step if opened is None else "")
     tab = _one_of(said, "tab", TABS, remarks)
-    table = TableLook()
+    table = NEW_TABLE
     try:
         table = look_of(said.get("table", ""))
     except InputError as error:

@@ -85,14 +85,18 @@ class TableLook:
 
     def text(self) -> str:
         """Filter and order as text for a link, such as "outliers,-px"; empty for those of a new page."""
-        same = replace(self, page=0) == TableLook()
+        same = replace(self, page=0) == NEW_TABLE
         return "" if same else f"{self.shown},{'-' if self.down else ''}{self.by}"
+
+
+NEW_TABLE = TableLook()
+"""The look of a new page's table."""
 
 
 def look_of(text: str) -> TableLook:
     """The look of which ``text`` is the text. Raises ``InputError`` for an unknown filter or column."""
     if not text:
-        return TableLook()
+        return NEW_TABLE
     shown, _, by = text.partition(",")
     column = by.removeprefix("-")
     if shown not in FILTERS or column not in SORTS:
@@ -109,7 +113,7 @@ class MatchTablePanel:
     def __init__(self, gui: viser.GuiApi, touches: Touches, changed: Callable[[object], None]) -> None:
         self._html = gui.add_html("")
         self._changed = changed
-        self.look = TableLook()
+        self.look = NEW_TABLE
         """As chosen by a person or a link."""
         self._followed: tuple[int, ...] = ()
         self._drawn: tuple | None = None
