@@ -7,9 +7,12 @@
 
 import ast
 import functools
+import re
 import subprocess
 import sys
+import tomllib
 from collections import defaultdict
+from importlib.metadata import packages_distributions, requires
 from pathlib import Path
 
 import networkx as nx
@@ -149,6 +152,32 @@ def test_spherloc_names_no_screen():
         if name.partition(".")[0] in SCREENS
     ]
     assert not broken, "spherloc must work without any screen; move this to spherloc_viz:\n" + "\n".join(broken)
+
+
+def distribution(requirement):
+    """The name of what is required by a line such as "numpy>=2.0,<3"."""
+    return re.split(r"[^\w.-]", requirement)[0].lower()
+
+
+def test_what_is_imported_is_installed_with_the_package():
+    """Or comes with what is declared. A package of an extra may only be asked for where it is needed, in a function, which can say what is missing."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    declared = {distribution(line) for line in project["dependencies"]}
+    declared |= {
+        distribution(line) for name in declared.copy() for line in requires(name) or () if "extra ==" not in line
+    }
+    makers = packages_distributions()
+    broken = []
+    for module, path in MODULES.items():
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and not node.level:
+                names = [node.module or ""]
+            for package in {name.partition(".")[0] for name in names} - {"spherloc", "spherloc_viz"}:
+                made_by = {maker.lower() for maker in makers.get(package, [])}
+                if package not in sys.stdlib_module_names and not made_by & declared:
+                    broken.append(f"{place(module, node.lineno)} imports {package}")
+    assert not broken, "not among the dependencies in pyproject.toml:\n" + "\n".join(broken)
 
 
 LOADER = """
