@@ -200,6 +200,15 @@ class RefinementStage(Stage):
     tilt_rad: float
     """Angle between the given gravity and that of the last pose."""
 
+    @property
+    def expected_errors(self) -> tuple[float, float] | None:
+        """Root mean square of the angle (degrees) and of the distance (m) by which the last pose is off; None if
+        unknown."""
+        variance = np.diagonal(self.covariance)
+        if not np.isfinite(variance).all():
+            return None
+        return float(np.degrees(np.sqrt(variance[:3].sum()))), float(np.sqrt(variance[3:].sum()))
+
 
 @dataclass(frozen=True)
 class Certificate:

@@ -92,8 +92,10 @@ class Configuration:
         return "m" if self.metric else "units"
 
     def length(self, metres: float, digits: int = 2) -> str:
-        """A length as text: in centimetres, or in units of the map with three digits."""
-        return f"{100 * metres:.{digits}f} cm" if self.metric else f"{metres:.3g} {self.unit}"
+        """A length as text: in centimetres, in metres from one on, or in units of the map with three digits."""
+        if not self.metric:
+            return f"{metres:.3g} {self.unit}"
+        return f"{100 * metres:.{digits}f} cm" if metres < 1.0 else f"{metres:.{digits}f} m"
 
     def json_text(self) -> str:
         """The text of ``configuration.json``; infinity is the text "inf"."""
@@ -103,7 +105,8 @@ class Configuration:
         """The differences to ``now``, as phrases such as "seed is 1, was 0"."""
         found = differences(_plain(self), _plain(now), _UNCOMPARED)
         # Options of two different estimators cannot be compared.
-        return [said for key, said in found.items() if "estimator" not in found or not key.startswith("options.")]
+        told = found | ({"scene_sha256": "the scene file is another one"} if "scene_sha256" in found else {})
+        return [said for key, said in told.items() if "estimator" not in found or not key.startswith("options.")]
 
 
 def configuration_of(

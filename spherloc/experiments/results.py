@@ -56,6 +56,10 @@ class QueryResult:
     """Angle between true and estimated rotation, degrees."""
     translation_error_m: float | None = None
     """Distance between true and estimated camera position, metres."""
+    expected_rotation_error_deg: float | None = None
+    """What the pose's covariance expects of that angle, root mean square, degrees."""
+    expected_translation_error_m: float | None = None
+    """The same of that distance, metres."""
     registration_error_m: float | None = None
     """Distance by which registration moves the query's depth to fit the map, metres; inf if it does not fit."""
     precision: float | None = None
@@ -103,7 +107,10 @@ _POSES = ("cam_from_map", "truth_cam_from_map")
 _WHOLE = {"index", "references", "matches", "inliers"}
 _TEXTS = {"query", "status", "gravity_source", "diagnosis", "recording", "message"}
 _NEEDED = {"index", "query", "status", "message", "remarks"}
-_LATER = {"gravity_source", "gravity_bound_deg", "gravity_error_deg"}
+_LATER = {
+    *("gravity_source", "gravity_bound_deg", "gravity_error_deg"),
+    *("expected_rotation_error_deg", "expected_translation_error_m"),
+}
 """Fields that older files do not have."""
 
 COLUMNS = tuple(name for name in _FIELDS if name not in _POSES)
@@ -391,7 +398,7 @@ class ResultsLog:
             if differences:
                 raise InputError(
                     f"{self.folder}: holds results of another configuration ({in_short(differences)}); give another "
-                    "folder."
+                    "folder (--output)."
                 )
         else:
             others = [name for name in (ROWS, *REWRITTEN) if os.path.lexists(self.folder / name)]

@@ -17,7 +17,7 @@ from spherloc.experiments.results import FAILED, LOCALIZED, UNREADABLE, QueryRes
 from spherloc.frontend.view import Matches, View
 from spherloc.metrics import evaluate
 from spherloc.outcome import judge
-from spherloc.trace import Trace
+from spherloc.trace import RefinementStage, Trace
 from spherloc.types import FloatArray
 
 T = TypeVar("T")
@@ -144,6 +144,8 @@ def _judged(scene: MapScene, view: View, references: tuple[View, ...], trace: Tr
     """The row, filled in from the trace."""
     problem, metrics, pose = trace.problem, evaluate(trace), trace.cam_from_map
     judged, registration_error_m = judge(trace), None
+    refinement = trace.stage(RefinementStage)
+    expected = None if refinement is None or pose is None else refinement.expected_errors
     remarks = tuple(dict.fromkeys((*row.remarks, *problem.remarks[len(scene.remarks) :])))
     if scene.registration is not None and pose is not None:
         try:
@@ -158,6 +160,8 @@ def _judged(scene: MapScene, view: View, references: tuple[View, ...], trace: Tr
         true_outlier_rate=None if problem.truth_inliers is None else float(np.mean(~problem.truth_inliers)),
         rotation_error_deg=metrics.rotation_error_deg,
         translation_error_m=metrics.translation_error_m,
+        expected_rotation_error_deg=None if expected is None else expected[0],
+        expected_translation_error_m=None if expected is None else expected[1],
         registration_error_m=registration_error_m,
         gravity_source=problem.gravity_source,
         gravity_bound_deg=float(np.degrees(problem.gravity_bound_rad)),

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import MapScene
+from spherloc.diagnosis.causes import Cause
 from spherloc.errors import InputError, RecordingError, reason, shorten, show
 from spherloc.estimators import options_type
 from spherloc.experiments.configuration import Configuration, configuration_of
@@ -52,7 +53,7 @@ from spherloc_viz.recording.origin import Origin
 if TYPE_CHECKING:
     from spherloc_viz.recording.storage.store import RecordingStore
 
-MAX_TOLD = 5
+MAX_TOLD, MAX_EACH = 5, 20
 
 
 @dataclass(frozen=True)
@@ -264,6 +265,7 @@ def _text(results: SequenceResults, summary: Summary) -> str:
     first = sum(any(remark.startswith(INITIALISED) for remark in row.remarks) for row in results.rows)
     if first:
         lines.append(f"  {first} initialised by {setting.options['initialise']}, the others tracked")
+    lines += [f"  {line}" for line in _wrong(results)]
     lines += [f"  success {_rate(rate, setting.unit)}" for rate in (*summary.success, *summary.registration_success)]
     if summary.median_rotation_error_deg is not None and summary.median_translation_error_m is not None:
         lines.append(
@@ -284,10 +286,38 @@ def _text(results: SequenceResults, summary: Summary) -> str:
             f"{summary.median_estimating_ms:.1f} ms for estimating"
         )
     lines += [f"  {line}" for line in gravity_by_source(results.rows)]
-    lines += [f"  {line}" for line in (*_skipped(summary), *_without_pose(results.rows))]
+    lines += [f"  {line}" for line in (*_skipped(summary), *_each(results), *_without_pose(results.rows))]
     if not timed(results):
         lines.append("  trajectory: times are places in the sequence, as the queries have no growing times")
     return "\n".join([*lines, f"  written to {results.folder}"])
+
+
+def _wrong(results: SequenceResults) -> Iterator[str]:
+    """A line on the queries that are localized with an error beyond all limits of the scene."""
+    limits, wrong = results.configuration.thresholds, []
+    for row in results.rows:
+        turned, moved = row.rotation_error_deg, row.translation_error_m
+        if row.status != LOCALIZED or turned is None or moved is None or not limits:
+            continue
+        if all(turned > degrees or moved > metres for degrees, metres in limits):
+            wrong.append(f"{row.query}: {turned:.3g} deg and {results.configuration.length(moved)} off")
+    if wrong:
+        more = f"; and {len(wrong) - MAX_TOLD} more, see results.csv" if len(wrong) > MAX_TOLD else ""
+        yield f"wrong by the truth, though localized: {'; '.join(wrong[:MAX_TOLD])}{more}"
+
+
+def _each(results: SequenceResults) -> Iterator[str]:
+    """A line for each query with a pose, where these are few."""
+    posed = [row for row in results.rows if row.status in POSED]
+    if len(posed) > MAX_EACH:
+        return
+    for row in posed:
+        turned, moved = row.expected_rotation_error_deg, row.expected_translation_error_m
+        off = ""
+        if turned is not None and moved is not None:
+            off = f", expected error {turned:.2g} deg and {results.configuration.length(moved)}"
+        why = f" ({row.diagnosis})" if row.diagnosis not in (None, str(Cause.OK)) else ""
+        yield f"{row.query}: {row.status}{why}, {row.inliers or 0:,} of {row.matches or 0:,} matches agree{off}"
 
 
 def _trajectory_lines(error: TrajectoryError | None, setting: Configuration) -> Iterator[str]:

@@ -141,7 +141,8 @@ def localize(
         seed: Seed of the estimator, the same for every query.
         option: Options of all estimators, such as bound_px=4; none and inf are values where they make sense.
         queries: Only these: names, or places counted from 0, the last one not included; all if not given.
-        output: Folder of the results; recordings/SCENE_ESTIMATOR_SEED if not given, or recordings/comparison_SEED.
+        output: Folder of the results; recordings/SCENE_ESTIMATOR_SEED if not given, or recordings/comparison_SEED; the
+            scene files of maps are called after their folders.
         record: Write a recording of each query.
         recordings: Folder of the recordings; a folder of that name in the output folder if not given.
         keep_gigabytes: Size limit of the recordings, GB (2, or their present size if larger). Above it the oldest
@@ -166,14 +167,23 @@ def localize(
     try:
         if len(paths) == len(names) == 1:
             words = names[0] if initialise is None else f"{initialise}+{names[0]}"
-            folder = output or RECORDINGS / f"{paths[0].stem}_{words}_{seed}"
+            folder = output or RECORDINGS / f"{_results_name(paths[0])}_{words}_{seed}"
             return localize_sequence(paths[0], [solving(names[0], folder)], seed, queries, retry_failed)
         base = output or RECORDINGS / f"comparison_{seed}"
-        each = {path: [solving(name, base / path.stem / name) for name in names] for path in paths}
+        each = {path: [solving(name, base / _results_name(path) / name) for name in names] for path in paths}
         return compare_sequences(each, seed, queries, retry_failed, base)
     except KeyboardInterrupt:
         # Without waiting for the thread that matches the next query; all that is done is on the disk.
         os._exit(INTERRUPTED)
+
+
+COMMON_STEMS = ("scene", "new_images")
+"""Names that `spherloc map` gives to the scene files of every map."""
+
+
+def _results_name(path: Path) -> str:
+    """What results of a scene file are called: its name, after that of its folder where many are called so."""
+    return f"{path.resolve().parent.name}_{path.stem}" if path.stem in COMMON_STEMS else path.stem
 
 
 def _name_and_options(text: str, common: Sequence[Sequence[str]]) -> tuple[str, tuple[str, ...]]:

@@ -147,7 +147,7 @@ def _outliers(view: RunView, stage: RefinementStage) -> Frame:
 
 def _error(view: RunView, stage: RefinementStage) -> Frame:
     state, mask = _last(view, stage)
-    known = uncertainty.rms(stage)
+    known = stage.expected_errors
     expected = (
         "The inliers leave the pose open, so that its error is unknown."
         if known is None

@@ -125,17 +125,9 @@ def _angle(view: RunView, frame: Frame) -> list[SceneItem]:
     return [Segments("uncertainty/angle", LAYER, np.stack([starts, ends], axis=1), colors, 2.0)]
 
 
-def rms(stage: RefinementStage) -> tuple[float, float] | None:
-    """Root mean square of the angle (degrees) and the distance (m) by which the pose is off; None if unknown."""
-    variance = np.diagonal(stage.covariance)
-    if not np.isfinite(variance).all():
-        return None
-    return float(np.degrees(np.sqrt(variance[:3].sum()))), float(np.sqrt(variance[3:].sum()))
-
-
 def spread(stage: RefinementStage, metric: bool = True) -> str:
-    """The same in words; if not ``metric``, in units of the map."""
-    known = rms(stage)
+    """How far the pose is off in words; if not ``metric``, in units of the map."""
+    known = stage.expected_errors
     return (
         "unknown: the inliers leave it open"
         if known is None

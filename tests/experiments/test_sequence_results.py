@@ -178,7 +178,7 @@ def test_damage_elsewhere_is_said_and_nothing_is_overwritten(tmp_path: Path) -> 
     ("change", "said"),
     [
         ({"seed": 1}, "(seed is 1, was 0)"),
-        ({"scene_sha256": "1" * 64}, "scene_sha256 is "),
+        ({"scene_sha256": "1" * 64}, "(the scene file is another one)"),
         ({"options": {"bound_px": 4.0}}, "(options.bound_px is 4.0, was 3.0; options.gravity_sd_deg is absent, was"),
         ({"estimator": "mc-exact", "options": {}}, "(estimator is 'mc-exact', was 'mc')"),
         ({"versions": {"spherloc": "1.1", "numpy": "2.0"}}, "(versions.spherloc is '1.1', was '1.0')"),
@@ -191,7 +191,7 @@ def test_another_configuration_is_refused_by_what_differs(tmp_path: Path, change
         log.append(row(0))
     with pytest.raises(InputError) as error:
         ResultsLog(tmp_path, replace(CONFIGURATION, **change))
-    assert said in str(error.value) and str(error.value).endswith("give another folder.")
+    assert said in str(error.value) and str(error.value).endswith("give another folder (--output).")
     with ResultsLog(tmp_path, replace(CONFIGURATION, scene="moved/walk.toml")) as log:
         assert list(log.rows) == ["image0.png"]
 
