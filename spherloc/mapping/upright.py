@@ -5,6 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from spherloc.errors import InputError, show
@@ -23,9 +24,11 @@ MAX_SPREAD_DEG = 25.0
 MIN_LIMIT_DEG, LIMIT_SPREADS = 2.0, 5.0
 """An image whose own gravity differs from the map's by more than the first (degrees), and by more than the second times
 the median of all images, has a wrong pose: at a place that looks like the right one."""
-GROUND_SHARE = 0.1
-"""Share of the points below the cameras that lies deeper than the ground: reflections, wrong points."""
-MIN_GROUND_POINTS = 30
+LAYER, LAYER_SHARE = 1.08, 0.5
+"""The ground is the deepest layer of points below the cameras, up to this factor higher or lower, that has at least
+this share of the points of the densest one: tables have fewer, and wrong points and reflections lie at all depths."""
+MIN_GROUND_POINTS, MIN_GROUND_SHARE = 30, 0.2
+"""Least number of points of the ground, and their least share of all below the cameras."""
 MEDIAN_DEPTH = 10.0
 """Median distance of a point to an image that sees it, in units of a map whose scale is unknown."""
 
@@ -120,22 +123,48 @@ def scale_by_distance(poses: Mapping[str, FloatArray], first: str, second: str, 
 
 
 def scale_by_height(poses: Mapping[str, FloatArray], points: FloatArray, level: Level, metres: float) -> MapScale:
-    """The scale that puts the cameras ``metres`` above the ground, the deepest of the points (N, 3) below them.
+    """The scale that puts the cameras ``metres`` above the ground, the deepest dense layer of points (N, 3) below them.
 
-    Raises ``InputError`` if there are too few points below the cameras.
+    Raises ``InputError`` if there are too few points below the cameras, or if these lie at all depths.
     """
     centres = np.stack([camera_centre(pose) for pose in poses.values()])
     offset = points - centres[KDTree(centres).query(points)[1]]
     below = offset @ level.down
-    # Nearly all points that are seen 45 degrees or more below the horizon are on the ground.
-    depths = below[below > 0.707 * np.linalg.norm(offset, axis=1)]
+    # Most points that are seen 45 degrees or more below the horizon are on the ground.
+    depths = np.sort(below[below > 0.707 * np.linalg.norm(offset, axis=1)])
     if len(depths) < MIN_GROUND_POINTS:
         raise InputError(
             f"only {len(depths)} points of the map lie below the cameras, too few to find the ground; give a distance "
             "between two images with --distance instead."
         )
-    height = float(np.quantile(depths, 1.0 - GROUND_SHARE))
-    return MapScale(metres / height, f"cameras {metres:g} m above the ground")
+    ground = _deepest_layer(depths)
+    if len(ground) < max(MIN_GROUND_POINTS, MIN_GROUND_SHARE * len(depths)):
+        raise InputError(
+            f"the {len(depths)} points of the map below the cameras lie at all depths, so that the ground cannot be told "
+            "from the rest; give a distance between two images with --distance instead."
+        )
+    height = float(np.median(ground))
+    spread = float(np.median(np.abs(ground - height))) / height
+    source = (
+        f"cameras {metres:g} m above the ground, which {len(ground):,} of {len(depths):,} points below them show to "
+        f"{max(spread, 1e-3):.1%}"
+    )
+    return MapScale(metres / height, source)
+
+
+def _deepest_layer(depths: FloatArray) -> FloatArray:
+    """Those of the ``depths`` (N,), ascending, that are in the deepest dense layer."""
+
+    def ends(depth: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        return np.searchsorted(depths, depth / LAYER), np.searchsorted(depths, depth * LAYER, "right")
+
+    first, last = ends(depths)
+    dense = last - first >= LAYER_SHARE * (last - first).max()
+    layer = depths[first[dense][-1] : last[dense][-1]]
+    for _ in range(10):  # from the edge of the layer to its middle
+        begin, end = ends(np.median(layer)[None])
+        layer = depths[begin[0] : end[0]]
+    return layer
 
 
 def scale_by_positions(poses: Mapping[str, FloatArray], positions: Positions, level: Level) -> MapScale:

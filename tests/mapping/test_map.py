@@ -1,6 +1,7 @@
 """Maps of photographs: rendered panoramas with known poses, on the way that the command takes, and what is refused."""
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -414,12 +415,17 @@ def test_the_height_of_the_cameras_gives_the_scale(rng):
     turn = so3_exp(np.array([0.3, -0.8, 0.5]))
     floor = np.column_stack([rng.uniform(-3, 3, (2000, 2)), rng.normal(0, 0.01, 2000)])
     walls = np.column_stack([rng.uniform(-3, 3, 2000), np.full(2000, 3.0), rng.uniform(0, 2.5, 2000)])
-    points = np.concatenate([floor, walls]) @ turn.T / 0.4
+    table = np.column_stack([rng.uniform(-1, 1, (500, 2)), np.full(500, 0.75)])
+    wrong = np.column_stack([rng.uniform(-3, 3, (1000, 2)), rng.uniform(-7, 0, 1000)])
+    points = np.concatenate([floor, walls, table, wrong]) @ turn.T / 0.4
     centres = np.column_stack([np.linspace(-2, 2, 5), np.zeros(5), np.full(5, 1.6)]) @ turn.T / 0.4
     poses = {str(index): np.column_stack([np.eye(3), -centre]) for index, centre in enumerate(centres)}
     level = Level(turn @ [0.0, 0.0, -1.0], "a test", 0.0, {})
     scale = scale_by_height(poses, points, level, 1.6)
-    assert scale.metres_per_unit == pytest.approx(0.4, rel=0.03)
+    assert scale.metres_per_unit == pytest.approx(0.4, rel=0.01)
+    assert re.search(r"which 1,\d\d\d of [\d,]+ points below them show to 0\.\d%", scale.source)
     np.testing.assert_allclose(upright_frame(level) @ level.down, [0, 0, -1], atol=1e-12)
     with pytest.raises(InputError, match="too few to find the ground"):
-        scale_by_height(poses, points[2000:], level, 1.6)
+        scale_by_height(poses, points[2000:4000], level, 1.6)
+    with pytest.raises(InputError, match="lie at all depths"):
+        scale_by_height(poses, points[4500:], level, 1.6)
