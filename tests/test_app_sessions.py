@@ -341,7 +341,7 @@ def test_pages_share_nothing_and_leave_nothing(house: House) -> None:
 
 def test_only_views_that_are_seen_are_drawn(house: House) -> None:
     _, session = house.visit()
-    table, residuals = session._display.panels._matches._html, session._display.panels._residuals._html
+    table, residuals = session._display.panels.matches._html, session._display.panels._residuals._html
     assert table.content == "" and residuals.content == "", "another tab is open"
 
     def see(names: str) -> None:

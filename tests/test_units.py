@@ -87,3 +87,13 @@ def test_a_recording_keeps_them(tmp_path: Path, scene_of) -> None:
 def test_metric_is_true_or_false(scene_of) -> None:
     with pytest.raises(ProblemError, match=r"metric is 1; give true or false\."):
         replace(scene_of("mei").problem(), metric=1)
+
+
+@pytest.mark.parametrize(("outlier_rate", "verdict"), [(0.5, "Localized"), (0.99, "Doubtful")])
+def test_without_the_truth_the_headline_is_what_the_run_is_judged_as(scene_of, outlier_rate, verdict):
+    problem = replace(scene_of("mei"), outlier_rate=outlier_rate).problem(1)
+    trace = estimate(replace(problem, truth_cam_from_map=None, truth_inliers=None), "mc")
+    assert "Pose found, truth unknown" in summary_html(trace)
+    judge(trace)
+    assert f">{verdict}</b>" in summary_html(trace) and "truth unknown" in summary_html(trace)
+    assert paint(trace, len(steps(trace)) - 1).step.equation == "", "limits that nothing is compared with"

@@ -160,7 +160,8 @@ def distribution(requirement):
 
 
 def test_what_is_imported_is_installed_with_the_package():
-    """Or comes with what is declared. A package of an extra may only be asked for where it is needed, in a function, which can say what is missing."""
+    """Or comes with what is declared. A package of an extra may only be asked for where it is needed, in a function,
+    which can say what is missing."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     declared = {distribution(line) for line in project["dependencies"]}
     declared |= {

@@ -136,7 +136,7 @@ def _without_gravity(
     """The estimate where gravity is beyond its bound: the pose that shows it, refined without gravity."""
     more = f": {wrong.support} different matches agree without it, {wrong.believed_support} with it"
     note = (
-        f"Gravity is off by {np.degrees(wrong.tilt_rad):.2g}°, beyond its bound of "
+        f"Gravity is off by {np.degrees(wrong.tilt_rad):.3g}°, beyond its bound of "
         f"{np.degrees(aligned.gravity_bound_rad):.2g}°{more if wrong.support > wrong.believed_support else ''}. The "
         "pose is found without it."
     )

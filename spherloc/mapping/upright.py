@@ -140,8 +140,8 @@ def scale_by_height(poses: Mapping[str, FloatArray], points: FloatArray, level: 
     ground = _deepest_layer(depths)
     if len(ground) < max(MIN_GROUND_POINTS, MIN_GROUND_SHARE * len(depths)):
         raise InputError(
-            f"the {len(depths)} points of the map below the cameras lie at all depths, so that the ground cannot be told "
-            "from the rest; give a distance between two images with --distance instead."
+            f"the {len(depths)} points of the map below the cameras lie at all depths, so that the ground cannot be "
+            "told from the rest; give a distance between two images with --distance instead."
         )
     height = float(np.median(ground))
     spread = float(np.median(np.abs(ground - height))) / height

@@ -8,6 +8,7 @@ import numpy as np
 
 from spherloc.diagnosis import Diagnosis
 from spherloc.metrics import evaluate
+from spherloc.outcome import Outcome, known_judgement
 from spherloc.trace import Trace
 from spherloc_viz import style
 from spherloc_viz.layers.comparison import duration_text
@@ -19,7 +20,10 @@ DIM = "opacity:.65"
 OPTIONS = {"bound_px": "Bound (px)", "noise_px": "Noise of an inlier (px)", "gravity_sd_deg": "Gravity sd (deg)"}
 """What the settings call options that advice names as code does."""
 WITHHELD = "Answers are hidden. This part would show them: switch Hide answers off to see it."
-WORDS = {"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUTLIER, UNKNOWABLE: style.OUTLIER}
+WORDS = {
+    **{"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUTLIER, UNKNOWABLE: style.OUTLIER},
+    **{str(Outcome.LOCALIZED): style.INLIER, str(Outcome.DOUBTFUL): style.CLIQUE},
+}
 """Values of a table that are shown in colour."""
 
 
@@ -121,7 +125,8 @@ def opening_card_html(label: str, words: str, share: float | None) -> str:
 
 
 def summary_of(trace: Trace) -> tuple[str, list[str]]:
-    """A run's verdict, and its errors, inliers and time."""
+    """A run's verdict, and its errors, inliers and time. Without the truth the verdict is what the run is judged as,
+    once that is known."""
     metrics = evaluate(trace)
     inliers = int(np.count_nonzero(trace.inlier_mask))
     facts = [f"{inliers} of {len(trace.problem)} inliers", duration_text(trace.timings_ms["total"])]
@@ -131,6 +136,9 @@ def summary_of(trace: Trace) -> tuple[str, list[str]]:
             length(metrics.translation_error_m, trace.problem.metric),
             *facts,
         ]
+    judged = known_judgement(trace)
+    if trace.cam_from_map is not None and metrics.success is None and judged is not None:
+        return str(judged.outcome), [*facts, "truth unknown"]
     return verdict(trace, metrics.success), facts
 
 

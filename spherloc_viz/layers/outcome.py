@@ -102,8 +102,10 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
         caption += f" within {bound} and what the error of gravity may add, {explained} of them within {bound}"
     if metrics.rotation_error_deg is None or metrics.translation_error_m is None:
         caption += f", found in {total:.1f} ms{proven}. "
-        caption += "The truth is unknown, so the share of agreeing matches is all there is to judge it by."
+        caption += "The truth is unknown: only the matches speak for it or against it."
+        limits = ""
     else:
+        limits = "success: error < 1° and < 0.1 m   (Sec. VI-A)"
         verdict = "a success" if metrics.success else "a failure"
         angle, length = angle_text(metrics.rotation_error_deg), view.length(metrics.translation_error_m)
         limit = view.length(SUCCESS_M)
@@ -113,7 +115,7 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
         caption += f"limits of 1° and {limit}."
     return Frame(
         caption,
-        "success: error < 1° and < 0.1 m   (Sec. VI-A)",
+        limits,
         cam_from_map,
         view.colors(style.OUTLIER, (trace.inlier_mask, style.INLIER)),
         trace.inlier_mask,
