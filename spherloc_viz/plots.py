@@ -12,7 +12,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from spherloc.experiments.results import FAILED, SequenceResults
+from spherloc.experiments.results import DOUBTFUL, FAILED, SequenceResults
 from spherloc.experiments.summary import timed
 from spherloc.experiments.sweep_plan import AXES
 from spherloc.experiments.sweep_rows import Point
@@ -106,16 +106,25 @@ MIN_EXTENT_M = 1.0
 """Least extent of the picture, so that a camera that stands still is not magnified to its noise."""
 
 
+MAX_POSES_NAMED = 12
+"""Largest number of poses whose queries are named where no error is known."""
+FEWEST_FRAMED = 3
+"""Number of believed poses from which on the picture is framed by them, and not by doubtful ones too."""
+
+
 def trajectory_png(results: SequenceResults) -> bytes:
     """PNG of the estimated positions coloured by their error, the true path as a line, and failures as crosses.
 
     Errors beyond the loosest limit of success have one colour. Where the truth is unknown, errors are those of the
-    registration, if there are any. The same results give the same bytes.
+    registration, if there are any; without any, doubtful poses are circles, and few queries are named. The same results
+    give the same bytes.
     """
     places = _from_above(results, results.positions_m)
     true_places = _from_above(results, results.true_positions_m)
+    believed = np.where(_are_doubtful(results)[:, None], np.nan, places)
+    framed = believed if np.isfinite(believed).all(axis=1).sum() >= FEWEST_FRAMED else places
     # About as high as the picture of the map, so that the bar of colours beside it is not longer.
-    figure, axes = _from_above_figure(results, _frame(places, true_places), 0.75, 1.1)
+    figure, axes = _from_above_figure(results, _frame(framed, true_places), 0.75, 1.1)
     _truth(axes, true_places, timed(results))
     _estimates(figure, axes, results, places, true_places)
     _without_place(axes, results, places, true_places)
@@ -276,8 +285,15 @@ def _estimates(
 ) -> None:
     errors_m, what, limit_m = _errors(results)
     plain = np.isfinite(places).all(axis=1) & np.isnan(errors_m)
-    if plain.any():
-        axes.plot(*places[plain].T, "o", color=css(ESTIMATE), markersize=5, label="estimate, error unknown", zorder=3)
+    doubtful = plain & _are_doubtful(results)
+    looks = ((plain & ~doubtful, ESTIMATE, "full", "localized"), (doubtful, OUTLIER, "none", "doubtful"))
+    for mask, color, fill, what in looks:
+        if mask.any():
+            label = f"{what}, error unknown: {np.count_nonzero(mask)}"
+            axes.plot(*places[mask].T, "o", color=css(color), fillstyle=fill, markersize=5, label=label, zorder=3)
+    if 0 < np.count_nonzero(plain) <= MAX_POSES_NAMED:
+        for k in np.flatnonzero(plain & _inside(axes, places)):
+            axes.text(*places[k], f"  {results.rows[k].query}", fontsize=8, va="center", parse_math=False, clip_on=True)
     coloured = np.isfinite(places).all(axis=1) & ~np.isnan(errors_m)
     if not coloured.any():
         return
@@ -294,6 +310,11 @@ def _estimates(
         axes.plot(*places[bad].T, "o", color=css(OUTLIER), markersize=5.5, label=label, zorder=3)
         for start, end in zip(true_places[bad], places[bad], strict=True):
             axes.plot(*np.stack([start, end]).T, color=css(OUTLIER), linewidth=0.8, zorder=1)
+
+
+def _are_doubtful(results: SequenceResults) -> BoolArray:
+    """(Q,) whether a query's pose is not believed."""
+    return np.array([status == DOUBTFUL for status in results.status], dtype=bool)
 
 
 def _errors(results: SequenceResults) -> tuple[FloatArray, str, float]:

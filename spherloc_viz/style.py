@@ -36,6 +36,7 @@ LEGEND: tuple[tuple[RGB, str], ...] = (
 
 LAYERS: tuple[str, ...] = (
     "mesh",
+    "point cloud",
     "ground",
     "map",
     "cameras",

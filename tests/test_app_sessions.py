@@ -188,12 +188,12 @@ def test_while_another_scene_opens_nothing_stands_under_its_name(house: House) -
     assert "opacity:.35" in story._outcome.content and shown not in story._summary.content
     assert "Opening &lt;elsewhere&gt;" in story._card.content and "1 of 2" in story._card.content
     drawn, look = session._display.canvas._painter._drawn, session._client.camera
-    until(lambda: "map/references" in drawn and not drawn["map/points"][0].visible)
+    until(lambda: "cloud/references" in drawn and not drawn["map/points"][0].visible)
     ends = [camera_centre(street.references[k].cam_from_map) for k in (0, -1)]
     middle = align_to_down(street.gravity_map) @ np.mean(ends, axis=0)
     until(lambda: np.linalg.norm(look.look_at - middle) < np.linalg.norm(ends[1] - ends[0]))
     session._display.end_opening()
-    until(lambda: drawn["map/points"][0].visible and not drawn["map/references"][0].visible)
+    until(lambda: drawn["map/points"][0].visible and not drawn["cloud/references"][0].visible)
     until(lambda: story._card.content == "" and story._summary.content == shown)
     assert "opacity:.35" not in story._outcome.content
 

@@ -199,7 +199,9 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     references = tuple(view for view in views if view.name not in chosen)
     down, assumed = gravity_of_map(gravity, references, where)
     queries = (view for view in views if view.name in chosen)
-    return settings.scene(path, queries, references, down, (*remarks, *left_out, *assumed), assumed_down=bool(assumed))
+    remarks = [*remarks, *left_out, *assumed]
+    cloud = model.points.xyz
+    return settings.scene(path, queries, references, down, remarks, assumed_down=bool(assumed), cloud=cloud)
 
 
 def _chosen(value: Any, names: list[str], where: str) -> list[str]:

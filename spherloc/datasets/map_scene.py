@@ -72,6 +72,8 @@ class MapScene:
     """Where the query camera is on the vehicle or device (3, 4): p_vehicle = R p_camera + t; None if not known."""
     mesh: Callable[[], bytes] | None = None
     """A binary glTF of the map in the map frame, metres, for the canvas."""
+    cloud: FloatArray | None = None
+    """Points (P, 3) of a map without a mesh, map frame, metres, for the canvas."""
     remarks: tuple[str, ...] = ()
     """What the loader skipped and why, in sentences."""
 

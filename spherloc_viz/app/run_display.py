@@ -13,6 +13,7 @@ from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis
 from spherloc.outcome import known_judgement
 from spherloc.trace import Trace
+from spherloc.types import FloatArray
 from spherloc_viz.app.catalog import Run
 from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.left_panels import LeftPanels
@@ -24,6 +25,7 @@ from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import changes_of, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.layers.outcome import early_table
+from spherloc_viz.layers.point_cloud import cloud_items
 from spherloc_viz.layers.primitives import Picture, SceneItem
 from spherloc_viz.layers.selection import with_selection
 
@@ -90,6 +92,9 @@ class RunDisplay:
         """A run, how often answers had been hidden or shown, and which were then asked for although hidden."""
         self._blind: tuple[Run, frozenset[str], Run, Run] | None = None
         """A run, what is withheld of it, the same without the truth if that is, and that without what came out."""
+        self._around: tuple[MapScene, FloatArray, tuple[SceneItem, ...]] | None = None
+        """A scene, how its map is turned, and its points and references."""
+        self._scene_of = places.scene_of
         self._theme = START_THEME
         self._redraw = places.redraw
         touches.on("reveal", self._reveal)
@@ -160,7 +165,7 @@ class RunDisplay:
         if last and alternative is not None:
             picture = with_alternative(picture, trace, alternative)
         drawn = with_selection(picture, trace, selected)
-        drawn = replace(drawn, scene=drawn.scene + controls.items(known, hidden))
+        drawn = replace(drawn, scene=drawn.scene + controls.items(known, hidden) + self._cloud(run))
         self._shown = known, mesh, drawn
         with self._client.atomic():
             self._follow_theme()
@@ -181,6 +186,15 @@ class RunDisplay:
             self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, early)
         self._client.flush()
         return self.canvas.check() if pause is None else pause
+
+    def _cloud(self, run: Run) -> tuple[SceneItem, ...]:
+        """The points of the run's map and its references."""
+        scene, turn = self._scene_of(run.request.scene.scene), run.trace.problem.aligned.map_turn
+        if scene is None:
+            return ()
+        if self._around is None or self._around[0] is not scene or not np.array_equal(self._around[1], turn):
+            self._around = scene, turn, cloud_items(scene, turn)
+        return self._around[2]
 
     def _untold(self, run: Run, withheld: frozenset[str]) -> tuple[Run, Run]:
         """The run without the truth, if that is withheld, and also without what came out."""

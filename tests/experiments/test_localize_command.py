@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -254,6 +255,13 @@ def test_the_picture_shows_truth_errors_and_failures(tmp_path: Path) -> None:
     assert run(blind, tmp_path / "blind" / "out") == 1
     assert near(pixels_of((tmp_path / "blind" / "out" / "trajectory.png").read_bytes()), TRUTH) == 0
     assert not (tmp_path / "blind" / "out" / "truth.tum").exists()
+    told = read_results(tmp_path / "blind" / "out")
+    posed = tuple(replace(item, status="localized") for item in told.rows if item.cam_from_map is not None)
+    believed, doubted = (
+        near(pixels_of(trajectory_png(replace(told, rows=rows))), OUTLIER)
+        for rows in (posed, (*posed[:-1], replace(posed[-1], status="doubtful")))
+    )
+    assert believed == 0 and doubted > 20, "a pose that is not believed looks like one that is"
     (tmp_path / "none").mkdir()
     assert run(write_scene(tmp_path / "none", queries=2, few=[0, 1]), tmp_path / "none" / "out") == 1
 

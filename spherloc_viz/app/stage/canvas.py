@@ -9,16 +9,15 @@ import numpy as np
 import viser
 
 from spherloc.datasets.map_scene import MapScene
-from spherloc.geometry import align_to_down, camera_centre
-from spherloc_viz import style
+from spherloc.geometry import align_to_down
 from spherloc_viz.app.catalog import Run
 from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.painter import LABEL_SCALE, Painter
 from spherloc_viz.app.stage.true_camera import TrueCamera
 from spherloc_viz.app.stage.views import MAX_BYTES, Walls
-from spherloc_viz.layers.frame import one_color
-from spherloc_viz.layers.primitives import Picture, Points
+from spherloc_viz.layers.point_cloud import cloud_items, reference_dots
+from spherloc_viz.layers.primitives import Picture
 
 FIRST_CHECKS, MAX_CHECKS, CHECK_S = 8, 40, 0.4
 """Number of checks of the first view, their largest number, and the time between two: a page that is still being built
@@ -27,8 +26,6 @@ MAX_PX = 1 << 20
 """Largest width and height of a window that are accepted from a page."""
 HELD = "held"
 """Used in place of a view's name for a view that a link asked for."""
-REFERENCE_DOT = 0.01
-"""Radius of a reference's dot before there is a run, as a share of the extent of all references."""
 MOVE_S = 1.0
 """Upper limit of the time in which the page moves its viewer smoothly (``smooth.js``)."""
 RESHAPED = 0.02
@@ -99,13 +96,11 @@ class Canvas:
     def draw_map(self, label: str, scene: MapScene, mesh: bytes | None) -> None:
         """Show a scene before there is a run of it: its mesh, and where its references stand."""
         turn, layers = align_to_down(scene.gravity_map), self._display.layers()
-        posed = [view.cam_from_map for view in scene.references if view.cam_from_map is not None]
-        places = np.array([camera_centre(pose) for pose in posed]).reshape(-1, 3) @ turn.T
+        dots = reference_dots(scene, turn)
+        places = dots.positions
         with self._lock:
             self._picture = None
-            size_m = float(np.max(np.ptp(places, axis=0), initial=0.0)) or 1.0
-            colors = one_color(style.UNDECIDED, len(places))
-            self._painter.draw([Points("map/references", "map", places, colors, REFERENCE_DOT * size_m)], layers)
+            self._painter.draw(cloud_items(scene, turn) or [dots], layers)
             self._painter.draw_backdrop(mesh, turn, "mesh" in layers)
         if label != self._scene and len(places):
             self._scene = label

@@ -12,6 +12,7 @@ from spherloc.geometry import yaw_rotation
 from spherloc.types import FloatArray
 from spherloc_viz.app.web.viser_internals import place_viewer
 from spherloc_viz.layers.frame import RING_ROOM, SPHERE_ROOM, circle, dense_points, sphere_box
+from spherloc_viz.layers.point_cloud import REFERENCES
 from spherloc_viz.layers.primitives import Label, Mesh, Picture, Points, SceneItem, Segments, Textured
 
 CELLS = 160
@@ -422,7 +423,11 @@ def _subject(name: str, picture: Picture) -> FloatArray:
         for item in picture.scene
         if isinstance(item, Segments) and item.layer in ("cameras", "scale bar")
     ]
-    route = [item.positions for item in picture.scene if isinstance(item, Points) and item.layer == "trajectory"]
+    route = [
+        item.positions
+        for item in picture.scene
+        if isinstance(item, Points) and (item.layer == "trajectory" or item.name == REFERENCES)
+    ]
     return np.vstack([dense_points(points.positions), surface.vertices, *lines, *route])
 
 
