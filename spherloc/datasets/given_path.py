@@ -2,17 +2,20 @@
 
 import re
 import shlex
+import tomllib
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 from spherloc.errors import InputError, shorten
-from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in
+from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in, read_file
 
 VIDEOS = {".360", ".avi", ".insv", ".m4v", ".mkv", ".mov", ".mp4", ".webm"}
 SCENE = "give the path of a scene file (TOML) or a bundled scene's name, which spherloc scenes lists"
 COMMAND = re.compile(r": spherloc [^;]*$")
 """A command at the end of a sentence."""
+MAX_SCENE_BYTES = 1_000_000
+"""Largest TOML file that is looked at."""
 _MAX_FOLDERS = 50
 """Largest number of subfolders that are searched for images."""
 
@@ -91,7 +94,7 @@ def _folder(path: Path) -> tuple[str, str]:
     if inside:
         what = f"a folder without images, but with {sum(inside.values()):,} in the folders in it"
         return what, f"make a map of them with: spherloc map {_quoted(path)}"
-    scenes = [name for name in names if name.endswith(".toml")]
+    scenes = [name for name in names if name.endswith(".toml") and _may_be_scene(path / name)]
     if scenes:
         return _counted(len(scenes), "scene file"), f"give one of them, such as {shorten(str(path / scenes[0]))}"
     videos = [name for name in names if Path(name).suffix.lower() in VIDEOS]
@@ -100,6 +103,15 @@ def _folder(path: Path) -> tuple[str, str]:
         advice = f"make a map of the frames of one with: spherloc map frames --video {video}"
         return _counted(len(videos), "video"), advice
     return ("an empty folder" if not names else "a folder without images or scene files"), SCENE
+
+
+def _may_be_scene(path: Path) -> bool:
+    """Whether a TOML file has a kind or a camera, as scene files do, or cannot be read, so that its loader says why."""
+    try:
+        table = tomllib.loads(read_file(path, MAX_SCENE_BYTES).decode())
+    except (InputError, OSError, ValueError):
+        return True
+    return not table or bool(table.keys() & {"kind", "camera"})
 
 
 def _images(names: Sequence[str]) -> int:

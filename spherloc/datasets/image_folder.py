@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table, load_camera
+from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets import map_scene, scene_file
 from spherloc.datasets.colmap import gravity_of_map, model_views, some, split_gravity, unit_vector
 from spherloc.datasets.map_scene import MapScene
@@ -232,14 +233,16 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     if camera is None:
         raise InputError(f"{where}: the query images have no camera; add 'calibration' or a section [camera].")
     queries, remarks = _queries(table, camera, gravity, path)
-    references, more = _references(table, camera, settings.frontend, path)
+    references, more, cloud = _references(table, camera, settings.frontend, path)
     down, assumed = gravity_of_map(gravity, references, where)
-    return settings.scene(path, queries, references, down, (*remarks, *more, *assumed), assumed_down=bool(assumed))
+    remarks = [*remarks, *more, *assumed]
+    return settings.scene(path, queries, references, down, remarks, assumed_down=bool(assumed), cloud=cloud)
 
 
 def _references(
     table: dict[str, Any], camera: Camera, frontend: Mapping[str, Any], path: Path
-) -> tuple[tuple[View, ...], list[str]]:
+) -> tuple[tuple[View, ...], list[str], FloatArray | None]:
+    """The references, remarks, and the points of the map's model if it has one."""
     if ("map" in table) == ("references" in table):
         raise InputError(f"{path}: needs either a section [map] with a COLMAP model or sections [[references]].")
     if "references" in table:
@@ -251,12 +254,14 @@ def _references(
                 "depth, or other references."
             )
         options = frontend_options(frontend, str(path), path.parent)
-        return with_triangulation(posed.views, options) if without else posed.views, list(posed.remarks)
+        views = with_triangulation(posed.views, options) if without else posed.views
+        return views, list(posed.remarks), None
     section = scene_file.section(table, "map", str(path))
     scene_file.check_keys(section, {"model", "images"}, set(), f"{path} [map]")
     images = map_scene.folder(section, "images", path)
-    views, remarks = model_views(read_model(map_scene.folder(section, "model", path)), images)
-    return tuple(views), remarks
+    model = read_model(map_scene.folder(section, "model", path))
+    views, remarks = model_views(model, images)
+    return tuple(views), remarks, model.points.xyz
 
 
 def _queries(
@@ -271,11 +276,11 @@ def _queries(
         down = Gravity(unit_vector(gravity["camera"], "camera", f"{where} [gravity]"), "the scene file")
     views, reasons = [], {}
     for name in names:
-        reason = _unusable(root / name, camera)
-        if reason:
+        reason, its_camera = _camera_of(root / name, camera)
+        if its_camera is None:
             reasons.setdefault(reason, []).append(name)
         else:
-            views.append(View(name, camera, root / name, truth.get(name), gravity=down))
+            views.append(View(name, its_camera, root / name, truth.get(name), gravity=down))
     return tuple(views), [f"{some(bad, 'query image')} left out: {reason}." for reason, bad in reasons.items()]
 
 
@@ -301,14 +306,18 @@ def _truth(table: dict[str, Any], names: list[str], where: str) -> dict[str, Flo
     return {name: read_pose(value, show(name), f"{where} [truth]") for name, value in truth.items()}
 
 
-def _unusable(path: Path, camera: Camera) -> str:
-    """Why an image cannot be a query, judged by its header alone; empty if it can."""
+def _camera_of(path: Path, camera: Camera) -> tuple[str, Camera | None]:
+    """The camera of a query image, judged by its header alone; or why it cannot be a query, and None. Panoramas are
+    of any size."""
     if not is_file(path):
-        return "no such file"
+        return "no such file", None
     try:
         width, height = read_size(path)
     except InputError:
-        return "not an image that can be read"
-    if (width, height) != (camera.width, camera.height):
-        return f"not {camera.width} x {camera.height} pixels, as the calibration is for"
-    return ""
+        return "not an image that can be read", None
+    if (width, height) == (camera.width, camera.height):
+        return "", camera
+    if isinstance(camera, Equirectangular) and width == 2 * height:
+        return "", Equirectangular(width, height)
+    shape = ", and not twice as wide as high" if isinstance(camera, Equirectangular) else ""
+    return f"not {camera.width} x {camera.height} pixels, as the calibration is for{shape}", None

@@ -46,6 +46,14 @@ def test_folders(tmp_path, names, said):
     assert "'" in told or "spherloc map" not in told  # a path with a space is quoted for the shell
 
 
+def test_other_files_that_end_like_scene_files_are_none(tmp_path):
+    (tmp_path / "pyproject.toml").write_text('[project]\nname = "photos"\n')
+    assert "is a folder without images or scene files" in what_it_is(tmp_path)
+    (tmp_path / "mine.toml").write_text('kind = "colmap"\n')
+    told = what_it_is(tmp_path)
+    assert "is a folder of 1 scene file; give one of them" in told and "mine.toml" in told
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [

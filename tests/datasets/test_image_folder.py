@@ -184,6 +184,19 @@ def test_a_colmap_model_as_the_map(rng, tmp_path):
     assert scene.references[0].camera.model == "kannala_brandt"
     assert scene.queries[0].camera.model == "equirectangular"
     assert scene.gravity_map[1] > 0.99 and len(scene.remarks) == 1
+    np.testing.assert_array_equal(scene.cloud, [point[1] for point in sample.points])
+
+
+def test_a_panorama_of_another_size_is_a_query_too(tmp_path):
+    path = make_tree(tmp_path, CAMERA + POSED)
+    cv2.imwrite(str(tmp_path / "queries" / "double.png"), np.zeros((64, 128, 3), np.uint8))
+    scene = load_scene(path)
+    assert [(view.name, view.camera.width, view.camera.height) for view in scene.queries] == [
+        ("a.jpg", 64, 32),
+        ("b.png", 64, 32),
+        ("double.png", 128, 64),
+    ]
+    assert scene.queries[2].read().shape == (64, 128, 3) and "left out" not in str(scene.remarks)
 
 
 MAP = '[map]\nmodel = "queries"\nimages = "queries"\n'
