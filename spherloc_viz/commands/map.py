@@ -202,6 +202,8 @@ def summary(made: Map, found: Photographs) -> list[str]:
 
 THUMBNAIL_PX = 240
 MAX_THUMBNAILS = 40
+MAX_NAMED = 30
+"""Largest number of images whose names stand in the picture from above."""
 MAX_POINTS = 20_000
 WITHIN = 0.98
 """Share of the points that the picture shows: a few far points would make the others too small."""
@@ -301,6 +303,12 @@ def why_not(made: Map, names: list[str], index: int) -> str:
     if counts.max() < MIN_MATCHES:
         return f"No other image has {MIN_MATCHES} matches with it that fit together: take images closer to it."
     best = int(np.where(inside, counts, -1).argmax())
+    if counts[best] < MIN_MATCHES:
+        other = int(counts.argmax())
+        return (
+            f"It has {counts[other]:,} matches with {names[other]}, which is not in the map either, and no image of "
+            f"the map has {MIN_MATCHES} matches with it that fit together: take images in between."
+        )
     return (
         f"It has {counts[best]} matches with {names[best]}, too few of which have a point in the map: take "
         "one more image near it."
@@ -330,6 +338,9 @@ def _from_above(made: Map, unit: str) -> str:
     axes.scatter(shown[:, 0], shown[:, 1], s=1.5, c="#8fa3b8", linewidths=0)
     axes.plot(centres[:, 0], centres[:, 1], color="#d08a1c", linewidth=0.8)
     axes.scatter(centres[:, 0], centres[:, 1], s=28, c="#c0392b", zorder=3)
+    if len(centres) <= MAX_NAMED:
+        for name, centre in zip(made.written.poses, centres, strict=True):
+            axes.text(*centre[:2], f"  {name}", fontsize=8, va="center", parse_math=False, clip_on=True)
     axes.set_xlabel(unit)
     axes.set_ylabel(unit)
     file = io.BytesIO()

@@ -103,6 +103,13 @@ def test_the_report_says_what_is_in_the_map(walk):
     assert "5 of 5" in page and "Not in the map" not in page and "data:image/png;base64," in page
     smaller = map_report(type(made)(made.made, made.level, made.scale, _less(made.written, "reference_004.png")), found)
     assert "4 of 5" in smaller and "reference_004.png: It has " in smaller
+    alone = made.made.matches.copy()
+    alone[3:, :3] = alone[:3, 3:] = 0
+    pair = replace(made, made=replace(made.made, matches=alone), written=made.written)
+    for name in ("reference_005.png", "reference_006.png"):
+        pair = replace(pair, written=_less(pair.written, name))
+    said = r"reference_006.png: It has [\d,]+ matches with reference_005.png, which is not in the map either"
+    assert re.search(said, map_report(pair, found))
     off = replace(made, scale=replace(made.scale, off_m={"reference_003.png": 1.239}))
     assert "1.24 m" in map_report(off, found) and "off its position" not in page
 
