@@ -197,7 +197,28 @@ def summary(made: Map, found: Photographs) -> list[str]:
             f"in doubt      {len(made.made.contradictions)} pairs of images see each other and hardly match (such as "
             f"{first}, {second}): places that look alike may have been taken for one"
         )
+    if far := misplaced(made):
+        lines.append(f"in doubt      {_far_words(far)}")
     return lines
+
+
+FAR, LEAST_FAR_M = 10.0, 0.5
+"""An image is misplaced if it is farther from the position given for it than this many times the median of all, and
+than so many metres."""
+
+
+def misplaced(made: Map) -> dict[str, float]:
+    """Distances, metres, of the images that are much farther than the others from the positions given for them, by
+    name, the farthest first."""
+    off_m = made.scale.off_m
+    limit_m = max(LEAST_FAR_M, FAR * float(np.median(list(off_m.values())))) if off_m else 0.0
+    return {name: off for name, off in sorted(off_m.items(), key=lambda item: -item[1]) if off > limit_m}
+
+
+def _far_words(far: Mapping[str, float]) -> str:
+    told = ", ".join(f"{name} {off:.2f} m" for name, off in list(far.items())[:5])
+    more = f" and {len(far) - 5} more" if len(far) > 5 else ""
+    return f"far from the given positions: {told}{more}; the map is wrong there, or the position is"
 
 
 THUMBNAIL_PX = 240
@@ -255,14 +276,16 @@ def map_report(made: Map, found: Photographs) -> str:
 
 
 def _doubts(made: Map) -> list[str]:
-    against = made.made.contradictions
+    against, far = made.made.contradictions, misplaced(made)
+    said = [f'<p class="out">Images {html.escape(_far_words(far))}.</p>'] if far else []
     if not against:
-        return []
+        return said
     pairs = "; ".join(f"{first} and {second}" for first, second in against[:10])
     return [
+        *said,
         '<p class="out">These images lie side by side in the map, in sight of each other, and hardly match. The map '
         "may take two places that look alike for one: "
-        f"{html.escape(pairs)}{' …' if len(against) > 10 else ''}</p>"
+        f"{html.escape(pairs)}{' …' if len(against) > 10 else ''}</p>",
     ]
 
 

@@ -23,7 +23,7 @@ from spherloc.mapping.make import ScaleMeasurement, make_map, scale_of
 from spherloc.mapping.photographs import _is_in, frames_of, photographs, two_circles
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
 from spherloc.problem import Problem
-from spherloc_viz.commands.map import _kind, main, map_report
+from spherloc_viz.commands.map import _kind, main, map_report, summary
 
 IMAGES = ("reference_002", "reference_003", "reference_004", "reference_005", "reference_006")
 
@@ -112,6 +112,11 @@ def test_the_report_says_what_is_in_the_map(walk):
     assert re.search(said, map_report(pair, found))
     off = replace(made, scale=replace(made.scale, off_m={"reference_003.png": 1.239}))
     assert "1.24 m" in map_report(off, found) and "off its position" not in page
+    names = sorted(made.written.poses)
+    off = replace(made, scale=replace(made.scale, off_m=dict(zip(names, (0.02, 0.03, 6.24, 0.02, 9.5), strict=True))))
+    told = f"far from the given positions: {names[4]} 9.50 m, {names[2]} 6.24 m; the map is wrong there"
+    assert told in "".join(summary(off, found)) and f"Images {told}" in map_report(off, found)
+    assert "in doubt" not in "".join(summary(made, found))
 
 
 def test_a_distance_to_an_image_that_is_not_in_the_map_leaves_the_units_unknown(walk):
