@@ -16,7 +16,7 @@ from spherloc.bounds import bounds_of
 from spherloc.consensus.chance import chance_rate, expected_text
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import search_two_point
-from spherloc.diagnosis.evidence import FEW, LOOSE_ENDS, different, pose_sd
+from spherloc.diagnosis.evidence import FEW, LOOSE_ENDS, MIN_SDS, different, pose_sd
 from spherloc.free_gravity import MAX_NFA, MIN_LEAD, count_distinct, expected_by_chance, lead, nearby_support
 from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
@@ -25,8 +25,6 @@ from spherloc.refine import gravity_sd_rad, residuals_px
 from spherloc.trace import ConsensusStage, RefinementStage, Trace
 from spherloc.types import BoolArray, FloatArray
 
-MIN_SDS = 2.0
-"""Number of standard deviations that must lie within the errors of a success."""
 SAMPLES, CONFIDENCE = 2000, 0.99
 """Samples and confidence of the search for an alternative pose among the matches that the pose does not explain."""
 FAR = 3.0

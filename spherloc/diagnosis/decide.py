@@ -7,6 +7,7 @@ import numpy as np
 
 from spherloc.diagnosis.causes import Cause, Diagnosis
 from spherloc.diagnosis.evidence import (
+    MIN_SDS,
     MISSED,
     STRONG,
     WIDER,
@@ -98,7 +99,10 @@ def without_truth(e: Evidence) -> Cause:
         return Cause.AMBIGUOUS
     if stands_out(e, own := e.alternatives_own()) and own >= STRONG * best:
         return Cause.FALSE_CONSENSUS
-    return Cause.ITERATIONS_RAN_OUT if missed(e, best) else Cause.OK
+    if missed(e, best):
+        return Cause.ITERATIONS_RAN_OUT
+    # The outcome asks for more: a pose that it doubts for that is not "ok".
+    return Cause.DEGENERATE if undetermined(MIN_SDS * e.rotation_sd_rad, MIN_SDS * e.position_sd_m) else Cause.OK
 
 
 def with_truth(e: Evidence, t: Truth) -> Cause:

@@ -215,6 +215,8 @@ LOOSE_ENDS = 2
 """Number of matches that are left out when it is judged how well the inliers fix a pose: they may agree by chance."""
 FEW = 8
 """Sets smaller than this are judged with all their members, since each is needed."""
+MIN_SDS = 2.0
+"""Number of standard deviations of a believed pose that must lie within the errors of a success."""
 BELIEVED_SDS = 4.0
 """Number of standard deviations of gravity that a refinement allows for at most."""
 DIFFERENT_RAD = np.radians(3.0)

@@ -163,7 +163,7 @@ def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause, unit: str)
     if cause is Cause.DEGENERATE:
         source = e if truth is None else truth
         fixed = f"{_distance(source.position_sd_m, unit)} and {_deg(source.rotation_sd_rad)}"
-        return f"Many matches agree, but they fix the pose to no better than {fixed} (1 sd)."
+        return f"The matches that agree fix the pose to no better than {fixed} (1 sd)."
     fit = truth.fit if truth is not None else e.tilted if cause is Cause.GRAVITY_OFF else e.free
     if fit is None:
         raise ValueError(f"{cause} was found without a pose to show it")
