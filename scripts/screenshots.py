@@ -29,7 +29,7 @@ APARTMENT, CAMPUS = "scenes/apartment_night_panorama.toml", "scenes/campus_panor
 PATIENCE_MS = 240_000
 JPEG = (cv2.IMWRITE_JPEG_QUALITY, 80, cv2.IMWRITE_JPEG_OPTIMIZE, 1)
 """With less quality small words get fringes."""
-STILL_S = 30.0
+STILL_S = 10.0
 """How long the page may go on changing before it is photographed all the same."""
 ROUNDING = 3
 """Largest difference of a colour, of 255, between two photographs of a page that stands still."""
@@ -117,7 +117,7 @@ def sweep(page: Page) -> None:
     tab(page, "Sweep")
     label = page.locator("label", has_text=re.compile("^Runs$"))
     entry = label.locator("xpath=ancestor::*[contains(@class, 'Flex-root')][1]").locator("input")
-    entry.fill("8")
+    entry.fill("4")
     entry.press("Enter")
     press(page, "Start sweep")
     page.get_by_role("button", name="CSV", exact=True).wait_for()
@@ -231,7 +231,7 @@ def still(page: Page) -> bytes:
     """The picture of the page once it stays the same for three photographs."""
     last, same, end = b"", 0, time.monotonic() + STILL_S
     while same < 2 and time.monotonic() < end:
-        page.wait_for_timeout(400)
+        page.wait_for_timeout(250)
         now = page.screenshot(timeout=PATIENCE_MS)
         same, last = (same + 1 if last and _alike(now, last) else 0), now
     return last
