@@ -129,10 +129,11 @@ def _of_folder(root: Path, inside: str, given: Mapping[str, Camera], panorama: b
         remarks.append(f"The calibration found beside them: {', '.join(map(shorten, used))}.")
     rest = sorted(name for names in sizes.values() for name in names if name not in camera_of)
     if rest and not camera_of and not given:
-        width, height = max(sizes, key=lambda size: len(sizes[size]))
+        order = sorted(sizes, key=lambda size: -len(sizes[size]))
+        told = ", ".join(f"{len(sizes[size])} of {size[0]} x {size[1]} pixels" for size in order[:MAX_NAMED])
+        files = "their calibration" if len(sizes) == 1 else "a file with the calibrations of all of them"
         raise InputError(
-            f"{folder}: its photographs are {width} x {height} pixels, so they are not full panoramas (2 to 1); "
-            "give their calibration with --camera FILE."
+            f"{folder}: its photographs, {told}, are not full panoramas (2 to 1); give {files} with --camera FILE."
         )
     if rest:
         width, height = next(size for size, names in sizes.items() if rest[0] in names)

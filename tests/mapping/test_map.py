@@ -422,6 +422,14 @@ def test_images_that_lean_against_the_map_are_told(walk):
     assert list(level.leaning) == [name] and level.leaning[name] == pytest.approx(np.degrees(0.1), abs=1.0)
 
 
+def test_photographs_of_an_unknown_camera_are_told_by_size(tmp_path, rng):
+    for name, size in (("a.png", (64, 48)), ("b.png", (60, 60)), ("c.png", (64, 48))):
+        picture(tmp_path / name, *size, rng)
+    told = "2 of 64 x 48 pixels, 1 of 60 x 60 pixels, are not full panoramas .* calibrations of all"
+    with pytest.raises(InputError, match=told):
+        photographs(tmp_path, {})
+
+
 def test_the_height_of_the_cameras_gives_the_scale(rng):
     """Cameras 1.6 m above a floor, in a model whose unit is 0.4 m and whose up is anywhere."""
     turn = so3_exp(np.array([0.3, -0.8, 0.5]))
