@@ -293,7 +293,8 @@ def _estimates(
             axes.plot(*places[mask].T, "o", color=css(color), fillstyle=fill, markersize=5, label=label, zorder=3)
     if 0 < np.count_nonzero(plain) <= MAX_POSES_NAMED:
         for k in np.flatnonzero(plain & _inside(axes, places)):
-            axes.text(*places[k], f"  {results.rows[k].query}", fontsize=8, va="center", parse_math=False, clip_on=True)
+            x, y = places[k]
+            axes.text(x, y, f"  {results.rows[k].query}", fontsize=8, va="center", parse_math=False, clip_on=True)
     coloured = np.isfinite(places).all(axis=1) & ~np.isnan(errors_m)
     if not coloured.any():
         return

@@ -162,7 +162,7 @@ def _deepest_layer(depths: FloatArray) -> FloatArray:
     dense = last - first >= LAYER_SHARE * (last - first).max()
     layer = depths[first[dense][-1] : last[dense][-1]]
     for _ in range(10):  # from the edge of the layer to its middle
-        begin, end = ends(np.median(layer)[None])
+        begin, end = ends(np.array([np.median(layer)]))
         layer = depths[begin[0] : end[0]]
     return layer
 

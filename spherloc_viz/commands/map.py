@@ -363,7 +363,7 @@ def _from_above(made: Map, unit: str) -> str:
     axes.scatter(centres[:, 0], centres[:, 1], s=28, c="#c0392b", zorder=3)
     if len(centres) <= MAX_NAMED:
         for name, centre in zip(made.written.poses, centres, strict=True):
-            axes.text(*centre[:2], f"  {name}", fontsize=8, va="center", parse_math=False, clip_on=True)
+            axes.text(centre[0], centre[1], f"  {name}", fontsize=8, va="center", parse_math=False, clip_on=True)
     axes.set_xlabel(unit)
     axes.set_ylabel(unit)
     file = io.BytesIO()
