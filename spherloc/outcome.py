@@ -16,7 +16,7 @@ from spherloc.bounds import bounds_of
 from spherloc.consensus.chance import chance_rate, expected_text
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import search_two_point
-from spherloc.diagnosis.evidence import FEW, LOOSE_ENDS, MIN_SDS, different, pose_sd
+from spherloc.diagnosis.evidence import MIN_SDS, agreeing, different, sd_of
 from spherloc.free_gravity import MAX_NFA, MIN_LEAD, count_distinct, expected_by_chance, lead, nearby_support
 from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
@@ -88,9 +88,8 @@ def _judge(trace: Trace) -> Judgement:
     aligned, bound_px = trace.problem.aligned, float(trace.options.bound_px)
     state, bounds = aligned.align_pose(trace.cam_from_map), bounds_of(aligned, bound_px)
     stage = trace.stage(RefinementStage)
-    limits = bounds.pixels if stage is not None and stage.dof == 4 else np.full(len(aligned.points), bound_px)
     errors = residuals_px(aligned, state)
-    inliers, fixed_by = errors <= limits, 3 if stage is not None and stage.dof == 6 else 2
+    inliers, fixed_by = agreeing(trace, errors), 3 if stage is not None and stage.dof == 6 else 2
     size, rate = count_distinct(aligned, inliers), chance_rate(aligned.bearings, np.minimum(bounds.radians, np.pi / 2))
     if fixed_by == 3:
         rate = chance_rate(aligned.bearings, bounds_of(replace(aligned, gravity_bound_rad=0.0), bound_px).radians)
@@ -160,11 +159,9 @@ def _gravity_margin(
 
 def _error_margin(trace: Trace, aligned: AlignedProblem, state: FloatArray, inliers: BoolArray) -> tuple[float, str]:
     """Margin of the covariance: natural logarithm of the ratio of a success's errors to the stated errors."""
-    size, options = int(np.count_nonzero(inliers)), trace.options
-    if size < 2:
+    rotation, position = sd_of(aligned, state, inliers, trace.options)
+    if np.isinf(position):
         return -np.inf, "Its inliers do not fix it."
-    drop, sd = LOOSE_ENDS if size >= FEW else 0, gravity_sd_rad(aligned, options)
-    rotation, position, _ = pose_sd(aligned, state, inliers, options.noise_px, sd, drop)
     worst = MIN_SDS * max(np.degrees(rotation) / SUCCESS_DEG, position / SUCCESS_M, 1e-300)
     fixed = f"{np.degrees(rotation):.2g}° and {position:.2g} {trace.problem.unit}"
     return -np.log(worst), f"Its inliers fix it to no better than {fixed} (1 sd)."

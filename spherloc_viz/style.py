@@ -17,6 +17,9 @@ SPHERE: RGB = (170, 190, 215)
 SELECTED: RGB = (176, 36, 228)
 SCALE: RGB = (128, 132, 140)
 """Colour of the scale bar."""
+CLOUD: RGB = (78, 84, 96)
+REFERENCE: RGB = (200, 150, 110)
+"""Colours of a map's points, fainter than any match, and of the places where its images were taken."""
 GROUND: RGB = (70, 74, 82)
 GROUND_ON_LIGHT: RGB = (200, 204, 210)
 """Colours of the grid at the foot of the map, faint on dark and on light."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from spherloc.datasets.failures import failure_case
-from spherloc.diagnosis import Cause
+from spherloc.diagnosis import Cause, diagnose
 from spherloc.estimators import default_options, estimate
 from spherloc.estimators.base import options_type
 from spherloc.metrics import evaluate
@@ -92,3 +92,16 @@ def test_truth_is_not_looked_at(scene_of):
     blind = replace(problem, truth_cam_from_map=None, truth_inliers=None)
     options = default_options("mc", problem)
     assert judge(estimate(problem, "mc", options)) == judge(estimate(blind, "mc", options))
+
+
+def test_the_diagnosis_doubts_what_the_outcome_doubts_for_its_covariance(scene_of):
+    """A few matches a problem, so that the covariance is near the limit: both say the same of the same pose."""
+    seen = set()
+    for seed in range(61_000, 61_040):
+        problem = scene_of("panorama", correspondences=14, outlier_rate=0.2, noise_px=3.0).problem(seed)
+        trace = estimate(problem, "mc", {"bound_px": 9.0, "noise_px": 3.0})
+        cause, judged = diagnose(trace, use_truth=False).cause, judge(trace)
+        fixed = all("Its inliers" not in reason for reason in judged.reasons)
+        seen.add((cause, fixed))
+        assert (cause, fixed) not in {(Cause.OK, False), (Cause.DEGENERATE, True)}, seed
+    assert {(Cause.OK, True), (Cause.DEGENERATE, False)} <= seen

@@ -139,7 +139,7 @@ def keep_possible(matches, cell, members, kept, scratch, cutoff, spread):
             starts[used], ends[used] = 0.0, EVERYWHERE
             free += 1
         else:
-            # Sines times flat and level, of which a direction does not depend.
+            # Times flat and level: the length of what a turn is taken of does not matter.
             sin1, sin2 = delta_flat, min(sin_e, level)
             cos1 = np.sqrt((flat - delta_flat) * (flat + delta_flat))
             cos2 = row[LEVEL_COSINE] if upright else np.sqrt((level - sin2) * (level + sin2))

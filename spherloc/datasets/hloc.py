@@ -224,7 +224,8 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     pairs, unpaired = _pairs(table, path, queries, references)
     said = (*remarks, *assumed, *skipped, *unknown, *missing, *unpaired)
     matcher = _matcher(table, path, model, tuple(references), pairs)
-    return settings.scene(path, queries, references, down, said, matcher=matcher, assumed_down=bool(assumed))
+    others = {"matcher": matcher, "assumed_down": bool(assumed), "cloud": model.points.xyz}
+    return settings.scene(path, queries, references, down, said, **others)
 
 
 def _check_combination(table: Mapping[str, Any], where: str) -> None:

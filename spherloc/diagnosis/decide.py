@@ -21,9 +21,9 @@ from spherloc.diagnosis.evidence import (
     gather_truth,
     measures_of,
     narrow_fit,
+    undetermined,
 )
 from spherloc.diagnosis.words import describe
-from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
 from spherloc.trace import RansacStage, Trace
 
 MAX_NFA = 0.01
@@ -102,7 +102,7 @@ def without_truth(e: Evidence) -> Cause:
     if missed(e, best):
         return Cause.ITERATIONS_RAN_OUT
     # The outcome asks for more: a pose that it doubts for that is not "ok".
-    return Cause.DEGENERATE if undetermined(MIN_SDS * e.rotation_sd_rad, MIN_SDS * e.position_sd_m) else Cause.OK
+    return Cause.DEGENERATE if e.reported_sd and undetermined(*(MIN_SDS * sd for sd in e.reported_sd)) else Cause.OK
 
 
 def with_truth(e: Evidence, t: Truth) -> Cause:
@@ -149,11 +149,6 @@ def believes(narrow: Narrow, truth: Truth | None) -> bool:
 def map_is_sparse(e: Evidence, right: int) -> bool:
     """Whether more matches are verified between the images but have no map point than there are ``right`` ones."""
     return e.verified_without_point > right
-
-
-def undetermined(rotation_sd_rad: float, position_sd_m: float) -> bool:
-    """Whether one standard deviation is already more than the error of a success."""
-    return rotation_sd_rad > np.radians(SUCCESS_DEG) or position_sd_m > SUCCESS_M
 
 
 def tilts(e: Evidence, tilt_rad: float, slack_rad: float) -> bool:

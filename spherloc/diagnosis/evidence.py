@@ -15,10 +15,10 @@ from spherloc.estimators.base import estimate
 from spherloc.estimators.mc_exact import McExactOptions
 from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD, tilt_of
 from spherloc.geometry import camera_centre, pose, rotation_angle, transform, yaw_rotation
-from spherloc.metrics import evaluate
+from spherloc.metrics import SUCCESS_DEG, SUCCESS_M, evaluate
 from spherloc.problem import AlignedProblem
 from spherloc.refine import RefinementOptions, gravity_sd_rad, refine, residuals_px
-from spherloc.trace import Certificate, ConsensusStage, Trace
+from spherloc.trace import Certificate, ConsensusStage, RefinementStage, Trace
 from spherloc.types import BoolArray, FloatArray
 
 SINGULAR = 1e-12
@@ -256,6 +256,8 @@ class Evidence:
     """Standard deviation of the best pose's rotation without the matches on which it depends most."""
     position_sd_m: float
     """The same for its position."""
+    reported_sd: tuple[float, float] | None
+    """The same two of the run's own pose, by which its outcome is judged; None without a pose."""
     verified_without_point: int
     """See ``Problem``."""
 
@@ -322,7 +324,7 @@ def gather(trace: Trace) -> Evidence:
         others = [*fits, alternative(aligned, best, bound_px, options)]
         others = [fit for fit in others if fit is not None and different(fit.cam_from_map, best.cam_from_map)]
         second = max(others, key=lambda fit: fit.support(bound_px), default=None)
-        sd = _sd(aligned, best, bound_px, options)
+        sd = sd_of(aligned, best.cam_from_map, best.errors_px <= bound_px, options)
     free = free_fit(aligned, [fit.cam_from_map for fit in fits[:2]], bound_px)
     tilted = max((fit for fit in (free, best) if fit), key=lambda fit: fit.support(bound_px), default=None)
     known = replace(aligned, gravity_bound_rad=0.0)
@@ -343,6 +345,7 @@ def gather(trace: Trace) -> Evidence:
         else _free_tilt_sd(aligned, tilted, (WIDER if tilted is free else 1.0) * bound_px),
         rotation_sd_rad=sd[0],
         position_sd_m=sd[1],
+        reported_sd=None if run is None else sd_of(aligned, run.cam_from_map, agreeing(trace, run.errors_px), options),
         verified_without_point=trace.problem.verified_without_point,
     )
 
@@ -363,14 +366,29 @@ def different(one: FloatArray, other: FloatArray) -> bool:
     return turn > DIFFERENT_RAD or distance > DIFFERENT_M
 
 
-def _sd(aligned: AlignedProblem, best: Fit, bound_px: float, options: RefinementOptions) -> tuple[float, float]:
-    """Standard deviations of rotation (rad) and position (m)."""
-    mask = best.errors_px <= bound_px
+def sd_of(
+    aligned: AlignedProblem, cam_from_map: FloatArray, mask: BoolArray, options: RefinementOptions
+) -> tuple[float, float]:
+    """Standard deviations of rotation (rad) and position (m) of an aligned pose (3, 4) that the matches of ``mask``
+    (M,) fix, without those on which it depends most; inf if they are too few."""
     size = int(np.count_nonzero(mask))
     if size < 2:
         return np.inf, np.inf
     drop = LOOSE_ENDS if size >= FEW else 0
-    return pose_sd(aligned, best.cam_from_map, mask, options.noise_px, gravity_sd_rad(aligned, options), drop)[:2]
+    return pose_sd(aligned, cam_from_map, mask, options.noise_px, gravity_sd_rad(aligned, options), drop)[:2]
+
+
+def undetermined(rotation_sd_rad: float, position_sd_m: float) -> bool:
+    """Whether one standard deviation is already more than the error of a success."""
+    return rotation_sd_rad > np.radians(SUCCESS_DEG) or position_sd_m > SUCCESS_M
+
+
+def agreeing(trace: Trace, errors_px: FloatArray) -> BoolArray:
+    """Which matches agree with the run's pose by their residuals (M,): within the bound on the noise or, where gravity
+    is kept, within one that allows for its error."""
+    stage, bound_px = trace.stage(RefinementStage), float(trace.options.bound_px)
+    kept = stage is not None and stage.dof == 4
+    return errors_px <= (bounds_of(trace.problem.aligned, bound_px).pixels if kept else bound_px)
 
 
 def _free_tilt_sd(aligned: AlignedProblem, free: Fit, bound_px: float) -> float:

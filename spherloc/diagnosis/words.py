@@ -6,7 +6,7 @@ import numpy as np
 
 from spherloc.consensus.chance import expected_text
 from spherloc.diagnosis.causes import Cause, Diagnosis
-from spherloc.diagnosis.evidence import MISSED, STRONG, Evidence, Fit, Narrow, Truth, apart, different
+from spherloc.diagnosis.evidence import MISSED, STRONG, Evidence, Fit, Narrow, Truth, apart, different, undetermined
 from spherloc.metrics import evaluate
 from spherloc.trace import Certificate, ConsensusStage, RansacStage, Trace
 
@@ -163,6 +163,8 @@ def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause, unit: str)
     if cause is Cause.DEGENERATE:
         source = e if truth is None else truth
         fixed = f"{_distance(source.position_sd_m, unit)} and {_deg(source.rotation_sd_rad)}"
+        if truth is None and e.reported_sd and not undetermined(e.rotation_sd_rad, e.position_sd_m):
+            fixed = f"{_distance(e.reported_sd[1], unit)} and {_deg(e.reported_sd[0])}"
         return f"The matches that agree fix the pose to no better than {fixed} (1 sd)."
     fit = truth.fit if truth is not None else e.tilted if cause is Cause.GRAVITY_OFF else e.free
     if fit is None:

@@ -29,6 +29,9 @@ LAYER, LAYER_SHARE = 1.08, 0.5
 this share of the points of the densest one: tables have fewer, and wrong points and reflections lie at all depths."""
 MIN_GROUND_POINTS, MIN_GROUND_SHARE = 30, 0.2
 """Least number of points of the ground, and their least share of all below the cameras."""
+FAR, LEAST_FAR_M = 10.0, 0.5
+"""An image is misplaced if it is farther from its position than this many times the median of all, and than so many
+metres."""
 MEDIAN_DEPTH = 10.0
 """Median distance of a point to an image that sees it, in units of a map whose scale is unknown."""
 
@@ -60,6 +63,12 @@ class MapScale:
     """Why the measurement gave no scale; empty if it did or if there is none."""
     off_m: Mapping[str, float] = field(default_factory=dict)
     """Distance of images to the positions that measured it, metres, by name."""
+
+    @property
+    def misplaced(self) -> dict[str, float]:
+        """Those distances of images that are much farther off than the others, the farthest first."""
+        limit_m = max(LEAST_FAR_M, FAR * float(np.median(list(self.off_m.values())))) if self.off_m else 0.0
+        return {name: off for name, off in sorted(self.off_m.items(), key=lambda item: -item[1]) if off > limit_m}
 
 
 def gravity_by_lines(views: Sequence[View], tell: Tell) -> dict[str, Gravity]:

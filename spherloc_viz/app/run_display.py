@@ -26,12 +26,16 @@ from spherloc_viz.app.web.viser_internals import changes_of, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.layers.outcome import early_table
 from spherloc_viz.layers.point_cloud import cloud_items
-from spherloc_viz.layers.primitives import Picture, SceneItem
+from spherloc_viz.layers.primitives import Label, Picture, SceneItem
 from spherloc_viz.layers.selection import with_selection
 
 START_THEME = "dark"
 ANSWERS = frozenset({"outcome", "truth"})
 """What may be hidden: what came out, until the last step, and the true pose with all that follows from it."""
+
+
+NAMED_AT = frozenset({"Matches", "Outcome"})
+"""Stages at whose steps references have their names in the canvas: elsewhere these cover what the step is about."""
 
 
 class Panel(Protocol):
@@ -165,7 +169,7 @@ class RunDisplay:
         if last and alternative is not None:
             picture = with_alternative(picture, trace, alternative)
         drawn = with_selection(picture, trace, selected)
-        drawn = replace(drawn, scene=drawn.scene + controls.items(known, hidden) + self._cloud(run))
+        drawn = replace(drawn, scene=drawn.scene + controls.items(known, hidden) + self._cloud(run, drawn.step.stage))
         self._shown = known, mesh, drawn
         with self._client.atomic():
             self._follow_theme()
@@ -187,14 +191,15 @@ class RunDisplay:
         self._client.flush()
         return self.canvas.check() if pause is None else pause
 
-    def _cloud(self, run: Run) -> tuple[SceneItem, ...]:
-        """The points of the run's map and its references."""
+    def _cloud(self, run: Run, stage: str) -> tuple[SceneItem, ...]:
+        """The points of the run's map and its references, with their names where the whole map is the subject."""
         scene, turn = self._scene_of(run.request.scene.scene), run.trace.problem.aligned.map_turn
         if scene is None:
             return ()
         if self._around is None or self._around[0] is not scene or not np.array_equal(self._around[1], turn):
             self._around = scene, turn, cloud_items(scene, turn)
-        return self._around[2]
+        items = self._around[2]
+        return items if stage in NAMED_AT else tuple(item for item in items if not isinstance(item, Label))
 
     def _untold(self, run: Run, withheld: frozenset[str]) -> tuple[Run, Run]:
         """The run without the truth, if that is withheld, and also without what came out."""

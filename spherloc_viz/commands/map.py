@@ -197,22 +197,9 @@ def summary(made: Map, found: Photographs) -> list[str]:
             f"in doubt      {len(made.made.contradictions)} pairs of images see each other and hardly match (such as "
             f"{first}, {second}): places that look alike may have been taken for one"
         )
-    if far := misplaced(made):
+    if far := made.scale.misplaced:
         lines.append(f"in doubt      {_far_words(far)}")
     return lines
-
-
-FAR, LEAST_FAR_M = 10.0, 0.5
-"""An image is misplaced if it is farther from the position given for it than this many times the median of all, and
-than so many metres."""
-
-
-def misplaced(made: Map) -> dict[str, float]:
-    """Distances, metres, of the images that are much farther than the others from the positions given for them, by
-    name, the farthest first."""
-    off_m = made.scale.off_m
-    limit_m = max(LEAST_FAR_M, FAR * float(np.median(list(off_m.values())))) if off_m else 0.0
-    return {name: off for name, off in sorted(off_m.items(), key=lambda item: -item[1]) if off > limit_m}
 
 
 def _far_words(far: Mapping[str, float]) -> str:
@@ -276,7 +263,7 @@ def map_report(made: Map, found: Photographs) -> str:
 
 
 def _doubts(made: Map) -> list[str]:
-    against, far = made.made.contradictions, misplaced(made)
+    against, far = made.made.contradictions, made.scale.misplaced
     said = [f'<p class="out">Images {html.escape(_far_words(far))}.</p>'] if far else []
     if not against:
         return said

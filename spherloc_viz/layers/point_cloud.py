@@ -14,7 +14,7 @@ MAX_POINTS = 8000
 """Largest number of points of the map that are drawn, an even sample."""
 SHARE, REACH = 0.9, 2.0
 """Points farther from the middle than this share of them, by more than this factor, are left out: they are wrong."""
-DOT, REFERENCE_DOT = 0.0015, 0.01
+DOT, REFERENCE_DOT = 0.0007, 0.01
 """Radius of a point's dot, as a share of the extent of the points, and of a reference's, of that of the references."""
 MAX_NAMED = 12
 """Largest number of references whose names are shown."""
@@ -27,12 +27,12 @@ def reference_dots(scene: MapScene, turn: FloatArray) -> Points:
     posed = [view.cam_from_map for view in scene.references if view.cam_from_map is not None]
     places = np.array([camera_centre(pose) for pose in posed]).reshape(-1, 3) @ turn.T
     size_m = float(np.max(np.ptp(places, axis=0), initial=0.0)) or 1.0
-    return Points(REFERENCES, LAYER, places, one_color(style.UNDECIDED, len(places)), REFERENCE_DOT * size_m)
+    return Points(REFERENCES, LAYER, places, one_color(style.REFERENCE, len(places)), REFERENCE_DOT * size_m)
 
 
 def cloud_items(scene: MapScene, turn: FloatArray) -> tuple[SceneItem, ...]:
-    """The points and the references of a scene that has points; nothing for another one. ``turn`` is as in
-    ``reference_dots``."""
+    """The points and the references of a scene that has points, these named if they are few; nothing for another
+    scene. ``turn`` is as in ``reference_dots``."""
     if scene.cloud is None or not len(scene.cloud):
         return ()
     away = np.linalg.norm(scene.cloud - np.median(scene.cloud, axis=0), axis=1)
@@ -42,11 +42,11 @@ def cloud_items(scene: MapScene, turn: FloatArray) -> tuple[SceneItem, ...]:
     dots = reference_dots(scene, turn)
     names = [view.name for view in scene.references if view.cam_from_map is not None]
     labels = [
-        Label(f"cloud/name-{k}", LAYER, place - np.array([0.0, 3.0 * dots.radius_m, 0.0]), name)
+        Label(f"cloud/name-{k}", LAYER, place + np.array([0.0, 3.0 * dots.radius_m, 0.0]), name)
         for k, (place, name) in enumerate(zip(dots.positions, names, strict=True))
     ]
     return (
-        Points("cloud/points", LAYER, points, one_color(style.UNDECIDED, len(points)), radius_m),
+        Points("cloud/points", LAYER, points, one_color(style.CLOUD, len(points)), radius_m),
         dots,
         *(labels if len(labels) <= MAX_NAMED else ()),
     )

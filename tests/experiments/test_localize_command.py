@@ -21,11 +21,13 @@ from sequence_samples import true_pose, write_scene
 from spherloc import registry
 from spherloc.errors import SpherlocError
 from spherloc.experiments import read_results
+from spherloc.mapping.written import NEW_SCENE, SCENE
 from spherloc.trajectory import read_tum
 from spherloc.warm_up import warm_up
 from spherloc_viz.commands.bundled import all_scenes, one_kind
 from spherloc_viz.commands.localize import Solving, compare_sequences, localize_sequence
 from spherloc_viz.commands.run import Records
+from spherloc_viz.commands.scene_commands import COMMON_STEMS, _results_name
 from spherloc_viz.plots import trajectory_png
 from spherloc_viz.recording.content.data import read_recording
 from tests.cli_process import spherloc_here
@@ -219,6 +221,13 @@ def test_wrong_words_are_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(SpherlocError, match=r"\(the scene file is another one\)"):
         run(scene, out)
     assert len(table(out)) == 2
+
+
+def test_results_of_two_maps_do_not_meet(tmp_path: Path) -> None:
+    assert {Path(SCENE).stem, Path(NEW_SCENE).stem} == set(COMMON_STEMS), "what every map calls its scene files"
+    maps = [tmp_path / name / NEW_SCENE for name in ("attic_map", "cellar_map")]
+    assert [_results_name(path) for path in maps] == ["attic_map_new_images", "cellar_map_new_images"]
+    assert _results_name(tmp_path / "street.toml") == "street"
 
 
 def pixels_of(png: bytes) -> np.ndarray:
