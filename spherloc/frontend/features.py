@@ -2,6 +2,7 @@
 
 import io
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import pi, tau
 from pathlib import Path
@@ -22,7 +23,7 @@ from spherloc.frontend.view import View
 from spherloc.images import MAX_BYTES
 from spherloc.types import BoolArray, ByteArray, FloatArray
 
-VERSION = 3
+VERSION = 4
 """Number to be increased when the same options give other features, so that old files are not used."""
 
 
@@ -73,7 +74,11 @@ def _content(path: Path) -> bytes | None:
         return None
 
 
-METHODS = tuple(KINDS)
+JOINED = {"sift+aliked": ("sift", "aliked")}
+"""Kinds of features that are found each by itself and used together."""
+JOINED_NUMBERS = 128
+"""Most numbers of a descriptor of one of these kinds."""
+METHODS = (*KINDS, *JOINED)
 MAX_FEATURES = 50_000
 RIM_PX = 4.0
 """Features this close to unusable pixels (large ones also farther away) show the rim of the image and not the scene."""
@@ -94,33 +99,42 @@ class FeatureOptions:
     method: str = "sift"
     """One of ``METHODS``; SIFT descriptors are root-normalised (RootSIFT)."""
     max_features: int | None = None
-    """Number of features that are kept, the strongest; None takes that of their kind (``Kind.most``)."""
+    """Number of features of each kind that are kept, the strongest; None takes that of the kind (``Kind.most``)."""
     weights: Path | None = None
     """ONNX file of the learned methods, ALIKED and DISK; ALIKED needs none if the extra ``learned`` is installed."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.method, str) or self.method not in KINDS:
+        if not isinstance(self.method, str) or self.method not in METHODS:
             raise InputError(f"The features {show(self.method)} are unknown; choose one of {', '.join(METHODS)}.")
-        count, kind = self.max_features, KINDS[self.method]
+        count, kinds = self.max_features, [KINDS[part] for part in self.parts]
         whole = isinstance(count, int) and not isinstance(count, bool)
         if count is not None and not (whole and 1 <= count <= MAX_FEATURES):
             raise InputError(f"max_features is {show(count)}; give a whole number from 1 to {MAX_FEATURES}.")
-        if kind.packaged and self.weights is None:
+        if self.weights is None and any(kind.packaged for kind in kinds):
             trained.check_installed(self.method)
-        if kind.learned and not kind.packaged and self.weights is None:
+        if self.weights is None and any(kind.learned and not kind.packaged for kind in kinds):
             raise InputError(f"{self.method} features need a file of weights; give its ONNX file as weights.")
-        if not kind.learned and self.weights is not None:
+        if self.weights is not None and not any(kind.learned for kind in kinds):
             raise InputError(f"{self.method} features have no weights; leave weights out, or take aliked or disk.")
 
     @property
+    def parts(self) -> tuple[str, ...]:
+        """The kinds of features, more than one if they are joined."""
+        return JOINED.get(self.method, (self.method,))
+
+    @property
     def most(self) -> int:
-        """Number of features that are kept."""
-        return KINDS[self.method].most if self.max_features is None else self.max_features
+        """Number of features that are kept; of joined ones, of all kinds together."""
+        return sum(KINDS[part].most if self.max_features is None else self.max_features for part in self.parts)
+
+    def part(self, kind: str) -> "FeatureOptions":
+        """The options of one of the kinds."""
+        return FeatureOptions(kind, self.max_features, self.weights if KINDS[kind].learned else None)
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Features of one image, the strongest first. Read-only arrays of N features."""
+    """Features of one image, the strongest of a kind first. Read-only arrays of N features."""
 
     pixels: FloatArray
     """(N, 2), the centre of the first pixel is (0.5, 0.5)."""
@@ -135,6 +149,8 @@ class Features:
     method: str
     image_size: tuple[int, int]
     """(width, height), px."""
+    parts: tuple["Features", ...] = ()
+    """Of joined kinds, the features of each, which follow one another here; otherwise empty."""
 
     def __post_init__(self) -> None:
         count = len(self.pixels)
@@ -155,6 +171,8 @@ def extract(view: View, options: FeatureOptions | None = None) -> Features:
     ``InputError`` if the image, its mask or the weights cannot be read, or if this OpenCV lacks the method.
     """
     options = options or FeatureOptions()
+    if len(options.parts) > 1:
+        return _joined([extract(view, options.part(kind)) for kind in options.parts], options.method)
     usable = view.usable_pixels()
     panorama = view.camera if isinstance(view.camera, Equirectangular) else None
     path = feature_file(view.path, usable, options, panorama is not None)
@@ -168,6 +186,27 @@ def extract(view: View, options: FeatureOptions | None = None) -> Features:
     pixels, (sizes, angles, scores) = table[:, :2].copy(), table[:, 2:].T.copy()
     size = (view.camera.width, view.camera.height)
     return Features(pixels, sizes, angles, scores, descriptors, options.method, size)
+
+
+def _joined(parts: Sequence[Features], method: str) -> Features:
+    """Features of several kinds as one. Each kind has numbers of its own in the descriptors, zeros elsewhere, so that
+    two kinds are never near each other."""
+    descriptors = np.zeros((sum(map(len, parts)), JOINED_NUMBERS * len(parts)), np.float32)
+    row = 0
+    for place, part in enumerate(parts):
+        numbers = part.descriptors.shape[1]
+        if numbers > JOINED_NUMBERS:
+            raise InputError(
+                f"{part.method} features of {numbers} numbers cannot be joined with others; take the published weights."
+            )
+        column = JOINED_NUMBERS * place
+        descriptors[row : row + len(part), column : column + numbers] = part.descriptors
+        row += len(part)
+    pixels, sizes, angles, scores = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("pixels", "sizes_px", "angles_rad", "scores")
+    )
+    return Features(pixels, sizes, angles, scores, descriptors, method, parts[0].image_size, tuple(parts))
 
 
 def _on_image(image: ByteArray, usable: ByteArray, options: FeatureOptions) -> tuple[FloatArray, Descriptors]:

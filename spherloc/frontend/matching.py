@@ -1,7 +1,7 @@
 """Matching of local features between a query and a reference image."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,8 @@ from spherloc.frontend.features import Features
 from spherloc.types import BoolArray, FloatArray
 
 METHODS = ("nearest", "lightglue")
+LIGHTGLUE_KIND = "aliked"
+"""The features that LightGlue matches: OpenCV 5.0 scales the keypoints as the networks for ALIKED need them."""
 BLOCK_BYTES = 16_000_000
 """Size of the block of similarities that is computed at once."""
 
@@ -23,10 +25,11 @@ class MatchOptions:
     """Options of the matching of features."""
 
     method: str = "nearest"
-    """"nearest": nearest neighbours of descriptors; "lightglue": a network that sees all of both images."""
+    """"nearest": nearest neighbours of descriptors; "lightglue": a network that sees all of both images. Where it is
+    for one of several joined kinds, the others are matched by nearest neighbours."""
     ratio: float | None = 0.8
     """Upper limit of the ratio of the nearest to the second nearest distance (Lowe 2004, Sec. 7.1); None: no limit. Not
-    for LightGlue."""
+    for what LightGlue matches."""
     mutual: bool = True
     """Whether the two features of a match must each be the nearest of the other, as LightGlue's always are."""
     weights: Path | None = None
@@ -71,6 +74,8 @@ def match(query: Features, reference: Features, options: MatchOptions | None = N
         raise InputError(
             f"Features {query.method} cannot be matched with {reference.method}; extract the same ones from all images."
         )
+    if query.parts:
+        return _by_parts(query, reference, options)
     if len(query) == 0 or len(reference) == 0:
         return FeatureMatches(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
     if query.descriptors.shape[1] != reference.descriptors.shape[1]:
@@ -86,8 +91,22 @@ def match(query: Features, reference: Features, options: MatchOptions | None = N
     return _once_a_place(found, query, reference)
 
 
+def _by_parts(query: Features, reference: Features, options: MatchOptions) -> FeatureMatches:
+    """Matches of joined kinds, each with its own."""
+    nearest = replace(options, method="nearest", weights=None)
+    index, other, ratios = [], [], []
+    start = start_there = 0
+    for part, there in zip(query.parts, reference.parts, strict=True):
+        found = match(part, there, options if part.method == LIGHTGLUE_KIND else nearest)
+        index.append(found.query_index + start)
+        other.append(found.reference_index + start_there)
+        ratios.append(found.ratios)
+        start, start_there = start + len(part), start_there + len(there)
+    return FeatureMatches(*(np.concatenate(parts) for parts in (index, other, ratios)))
+
+
 def _by_lightglue(query: Features, reference: Features, options: MatchOptions) -> FeatureMatches:
-    if query.method != "aliked":  # OpenCV 5.0 scales the keypoints as the networks for ALIKED need them
+    if query.method != LIGHTGLUE_KIND:
         raise InputError(
             f"LightGlue is for aliked features, not {query.method}; take those, or the matching 'nearest'."
         )

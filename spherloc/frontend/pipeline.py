@@ -255,7 +255,7 @@ def _correspondences(query: Features, reference: View, options: FrontendOptions)
     reference_pixels = features.pixels[matches.reference_index]
     points, lifted = reference.lift(reference_pixels)
     wrong = None
-    if options.matching.method == "nearest" and len(matches):
+    if options.matching.method == "nearest" and len(matches) and not query.parts:
         binary = KINDS[query.method].binary
         wrong = wrong_matches(len(query), len(matches), options.matching.ratio, binary) * float(lifted.mean())
     return _ReferenceMatches(

@@ -29,8 +29,11 @@ Floats = NDArray[np.float32]
 
 
 def real_descriptors(features: Features) -> Floats:
-    """Descriptors (N, D) of the strongest features as unit vectors; bits of binary ones count as +1 and -1."""
-    descriptors = features.descriptors[:STRONGEST]
+    """Descriptors (N, D) of the strongest features as unit vectors; bits of binary ones count as +1 and -1.
+
+    Of joined kinds, the first is taken: VLAD compares features of one kind.
+    """
+    descriptors = (features.parts[0] if features.parts else features).descriptors[:STRONGEST]
     if descriptors.dtype == np.uint8:
         descriptors = 2.0 * np.unpackbits(descriptors.astype(np.uint8), axis=1) - 1.0
     lengths = np.linalg.norm(descriptors, axis=1, keepdims=True)

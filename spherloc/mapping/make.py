@@ -9,6 +9,7 @@ from spherloc.files import is_folder
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
+from spherloc.mapping.carried import carried_nadir_deg
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.positions import Positions, gps_of_images
 from spherloc.mapping.reconstruction import Reconstruction, reconstruct
@@ -55,6 +56,9 @@ class Map:
     """Maps of other images, which could not be joined with this one."""
     features: str = "sift"
     """Name of the features that were matched."""
+    carried_deg: float = 0.0
+    """Half the opening angle of the cone around straight down that was left out, since what is in it moves with the
+    camera; 0 if nothing was found."""
 
 
 def make_map(
@@ -66,11 +70,14 @@ def make_map(
     tell: Tell,
     masks: Masks | None = None,
     how: FrontendOptions | None = None,
+    *,
+    find_carried: bool = True,
 ) -> Map:
     """Make a map of images of one camera or several and write it into ``folder``.
 
     ``new_images`` is a folder of other images of the one camera, for which a scene is written too; ``masks`` are the
-    masks of the views, which are written into the scenes, and ``how`` says which features are matched. Raises
+    masks of the views, which are written into the scenes, and ``how`` says which features are matched. With
+    ``find_carried``, what moves with the camera below panoramas is found and left out, too. Raises
     ``InputError`` if the images give no map, if ``measured`` names other images, if there are new images of several
     cameras, or if a file cannot be read or written.
     """
@@ -92,12 +99,17 @@ def make_map(
         raise InputError(f"{folder}: cannot be made ({error.strerror}); give another --output.") from None
     if measured == ScaleMeasurement():
         measured = ScaleMeasurement(positions=gps_of_images(views))
+    carried_deg = carried_nadir_deg(views, tell) if find_carried else 0.0
+    if carried_deg:
+        views, _ = Masks(nadir_deg=carried_deg).on(views)
+        masks = replace(masks or Masks(), nadir_deg=carried_deg)
     kept = Kept(masks, how or FrontendOptions())
     gravity = gravity_by_lines(views, tell)
     first, *others = reconstruct(views, [gravity.get(view.name) for view in views], folder, tell, how)
     found = _finished(first, views, nearer_to_others(first, others), gravity, measured, tell)
     inside = set(found[0].poses)
-    made = Map(*found, write_map(*found, views, images, folder, new_images, kept), features=kept.how.features.method)
+    written = write_map(*found, views, images, folder, new_images, kept)
+    made = Map(*found, written, features=kept.how.features.method, carried_deg=carried_deg)
     groups: list[Map] = []
     for other in others:
         if len(other.poses.keys() - inside) < MIN_OF_GROUP:

@@ -45,9 +45,13 @@ from spherloc.types import FloatArray
 from spherloc_viz.commands.progress import progress, say
 
 REPORT = "report.html"
-MAP_FEATURES = ("sift", "aliked")
-""""sift" is what is taken by itself, though "aliked" be installed: images of one camera have more right matches by it,
-which are better placed (``python -m benchmarks.features``)."""
+MAP_FEATURES = {
+    "sift": "SIFT",
+    "aliked": "ALIKED, matched by LightGlue",
+    "sift+aliked": "SIFT, and ALIKED matched by LightGlue",
+}
+"""Kinds of features and what they are called. "sift" is what is taken by itself, though ALIKED be installed: LightGlue
+takes seconds a pair (``python -m benchmarks.features``)."""
 
 
 def make(
@@ -60,14 +64,16 @@ def make(
     *,
     panorama: bool,
     masks: Masks | None,
+    find_carried: bool,
     positions: Path | None,
     features: str,
 ) -> int:
     """Make the map, and print the result and what to do next; returns 1 if not all images are in it.
 
     ``cameras`` are those of the calibration file by name, ``video`` a file and a number of frames to take from it into
-    ``folder``; with ``panorama``, images of 2 to 1 are panoramas in any case. ``positions`` is a file of where the
-    images were taken, and ``features`` one of ``MAP_FEATURES``. Raises ``InputError``.
+    ``folder``; with ``panorama``, images of 2 to 1 are panoramas in any case. With ``find_carried``, what moves with
+    the camera below panoramas is left out, too. ``positions`` is a file of where the images were taken, and
+    ``features`` one of ``MAP_FEATURES``. Raises ``InputError``.
     """
     end_without_a_trace()
     how = how_of(features)
@@ -81,7 +87,7 @@ def make(
         for remark in found.remarks:
             say(remark)
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
-        made = make_map(found.views, folder, target, measured, new_images, tell, masks, how)
+        made = make_map(found.views, folder, target, measured, new_images, tell, masks, how, find_carried=find_carried)
     report = target / REPORT
     try:
         report.write_text(map_report(made, found), encoding="utf-8")
@@ -115,18 +121,18 @@ def cameras_of_file(file: Path | None, name: str | None) -> dict[str, Camera]:
 def how_of(features: str) -> FrontendOptions:
     """Features with their usual matching; raises ``InputError`` if they are unknown or not installed."""
     if features not in MAP_FEATURES:
-        raise InputError(f"--features is {show(features)}; give {' or '.join(MAP_FEATURES)}.")
+        raise InputError(f"--features is {show(features)}; give {', '.join(MAP_FEATURES)}.")
     if features == "sift":
         return FrontendOptions()
-    return FrontendOptions(FeatureOptions("aliked"), MatchOptions("lightglue", ratio=None))
+    return FrontendOptions(FeatureOptions(features), MatchOptions("lightglue"))
 
 
 def about_features(made: Map) -> str:
     """A sentence on the features that were used, and on others that could be used."""
-    if made.features == "sift":
-        there = "" if trained.installed() else ", with the extra 'learned'"
-        return f"SIFT; ALIKED with LightGlue is --features aliked{there}"
-    return "ALIKED, matched by LightGlue"
+    if made.features != "sift":
+        return MAP_FEATURES[made.features]
+    there = "" if trained.installed() else ", with the extra 'learned'"
+    return f"SIFT; with ALIKED and LightGlue beside it: --features sift+aliked{there}"
 
 
 def _take_frames(video: Path, count: int, folder: Path, tell: Tell) -> None:
@@ -187,6 +193,8 @@ def summary(made: Map, found: Photographs) -> list[str]:
         f"features      {about_features(made)}",
         f"scale         {made.scale.source or _units_unknown(made)}",
     ]
+    if made.carried_deg:
+        lines.append(f"masked        {_carried_words(made.carried_deg)}")
     if missing:
         lines.append(f"left out      {', '.join(missing[:5])}{', …' if len(missing) > 5 else ''}: see the report")
     for group in made.groups:
@@ -200,6 +208,12 @@ def summary(made: Map, found: Photographs) -> list[str]:
     if far := made.scale.misplaced:
         lines.append(f"in doubt      {_far_words(far)}")
     return lines
+
+
+def _carried_words(degrees: float) -> str:
+    return (
+        f"{degrees:g}° around straight down, where all images show the same: what carries the camera (--nadir 0: not)"
+    )
 
 
 def _far_words(far: Mapping[str, float]) -> str:
@@ -235,7 +249,8 @@ def map_report(made: Map, found: Photographs) -> str:
         "Points": f"{len(written.points):,}",
         "Mean reprojection error": f"{written.error_px:.2f} px",
         "Down": f"from {made.level.source}; single images differ from it by {made.level.spread_deg:.1f}° in the median",
-        "Features": "SIFT" if made.features == "sift" else "ALIKED, matched by LightGlue",
+        "Features": MAP_FEATURES[made.features],
+        **({"Masked": _carried_words(made.carried_deg)} if made.carried_deg else {}),
         "Scale": scale,
     }
     rows = [_row(made, names, index) for index in range(len(views))]

@@ -315,7 +315,7 @@ def map(
     mask: OptionalPath = None,
     nadir: OptionalFloat = None,
     seam: OptionalFloat = None,
-    features: Annotated[str, arg(metavar="sift|aliked")] = "sift",
+    features: Annotated[str, arg(metavar="sift|aliked|sift+aliked")] = "sift",
     localize: OptionalPath = None,
 ) -> int:
     """Make a map of your own photographs: panoramas, or images of calibrated wide cameras.
@@ -345,9 +345,10 @@ def map(
         positions: Where the images were taken, which gives the scale: rows of image x y z, a table with columns image,
             lat, lon, or a trajectory (TUM, EuRoC) if their names hold the time. GPS in the photographs needs no file.
         mask: An image that is black where a photograph may not be used, or a folder of them by the images' names.
-        nadir: Leave out what is within so many degrees of straight down: the car, the tripod.
+        nadir: Leave out what is within so many degrees of straight down, such as the tripod; without it, what all
+            panoramas show in the same direction down there is left out.
         seam: Leave out so many degrees on both sides of the seam between the two lenses of a 360-degree camera.
-        features: What is matched: sift, or aliked with LightGlue (the extra learned).
+        features: What is matched: sift, aliked with LightGlue (the extra learned), or both.
         localize: Folder of other images of that camera; a scene is written that localizes them in the map.
     """
     from spherloc.frontend.masks import Masks
@@ -377,6 +378,7 @@ def map(
         localize,
         panorama=panorama,
         masks=masks,
+        find_carried=nadir is None,
         positions=positions,
         features=features,
     )

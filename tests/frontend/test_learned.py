@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from spherloc.errors import InputError
-from spherloc.frontend.features import FeatureOptions, Features, extract
+from spherloc.frontend.features import JOINED_NUMBERS, FeatureOptions, Features, extract
 from spherloc.frontend.matching import MatchOptions, match
+from spherloc.frontend.retrieval import real_descriptors
 from tests.frontend.pictures import disc, fisheye, texture, view_of
 from tests.frontend.small_networks import described_grid, nearest_place
 from tests.needs import needs
@@ -165,3 +166,40 @@ def test_lightglue_is_for_aliked(rng, tmp_path):
     found = aliked_features(np.ones((3, 2)), np.ones((3, 2), np.float32), (10, 10), method="disk")
     with pytest.raises(InputError, match="LightGlue is for aliked features, not disk"):
         match(found, found, MatchOptions("lightglue", weights=tmp_path / "any.onnx"))
+
+
+@needs("opencv 5")
+def test_joined_kinds_are_found_and_matched_each_by_its_own(tmp_path, rng):
+    """SIFT's features and those of the network, in this order; nearest neighbours match the former, LightGlue the
+    latter, and no match is between two kinds."""
+    view = view_of(tmp_path, texture(rng, 160, 160), fisheye(160))
+    weights = network(tmp_path, "aliked")
+    sift, aliked = extract(view, FeatureOptions("sift")), extract(view, FeatureOptions("aliked", weights=weights))
+    both = extract(view, FeatureOptions("sift+aliked", weights=weights))
+    assert len(sift) > 20 and len(both) == len(sift) + len(aliked) and both.method == "sift+aliked"
+    assert np.array_equal(both.pixels, np.concatenate([sift.pixels, aliked.pixels]))
+    distances = np.linalg.norm(both.descriptors[: len(sift), None] - both.descriptors[None, len(sift) :], axis=2)
+    assert distances.min() > 1.0
+    assert np.array_equal(real_descriptors(both), real_descriptors(sift))
+
+    lightglue = tmp_path / "lightglue.onnx"
+    lightglue.write_bytes(nearest_place(len(aliked), len(aliked)))
+    found = match(both, both, MatchOptions("lightglue", weights=lightglue))
+    own = match(sift, sift), match(aliked, aliked, MatchOptions("lightglue", weights=lightglue))
+    assert len(own[0]) > 10 and len(own[1]) > 10
+    for side in ("query_index", "reference_index"):
+        expected = np.concatenate([getattr(own[0], side), getattr(own[1], side) + len(sift)])
+        assert np.array_equal(getattr(found, side), expected)
+    assert (np.isnan(found.ratios) == (found.query_index >= len(sift))).all()
+
+
+@needs("opencv 5")
+def test_joined_kinds_of_an_image_without_any_of_one(tmp_path, rng):
+    """An even image has no feature of SIFT; what is of the other kind keeps its place in the descriptors."""
+    weights = network(tmp_path, "aliked")
+    options = FeatureOptions("sift+aliked", weights=weights)
+    even = extract(view_of(tmp_path, np.full((160, 160, 3), 90, np.uint8), fisheye(160), name="even.png"), options)
+    other = extract(view_of(tmp_path, texture(rng, 160, 160), fisheye(160)), options)
+    assert [len(part) > 0 for part in even.parts] == [False, True]
+    assert even.descriptors.shape[1] == other.descriptors.shape[1]
+    assert not even.descriptors[:, :JOINED_NUMBERS].any() and even.descriptors[:, JOINED_NUMBERS:].any(axis=1).all()
