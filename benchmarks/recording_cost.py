@@ -32,8 +32,9 @@ from spherloc_viz.layers.primitives import Balls, Label, Mesh, Picture, Points, 
 from spherloc_viz.recording.content.components import bars
 from spherloc_viz.recording.content.drawing import chart_path
 from spherloc_viz.recording.content.layout import blueprint, shown_in
+from spherloc_viz.recording.content.names import APPLICATION_ID
 from spherloc_viz.recording.content.panels import panels_of
-from spherloc_viz.recording.content.properties import APPLICATION_ID, step_text
+from spherloc_viz.recording.content.texts import step_text
 from spherloc_viz.recording.content.writer import recorded_steps
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.storage.store import RecordingStore

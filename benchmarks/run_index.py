@@ -33,7 +33,8 @@ from spherloc_viz.given_files import REVIEW_SUFFIX
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, Range, RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.reviews import review_path, write_review
+from spherloc_viz.recording.review_file import write_review
+from spherloc_viz.recording.reviews import review_path
 from spherloc_viz.recording.run_row import RunRow
 
 RESULTS = Path(__file__).parent / "results" / "run_index.json"

@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
-from spherloc_viz.recording.content.properties import APPLICATION_ID
+from spherloc_viz.recording.content.names import APPLICATION_ID
 
 FOOT_BYTES = 32
 ALONE = "in a chunk of its own"

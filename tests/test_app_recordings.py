@@ -24,7 +24,8 @@ from spherloc_viz.app.review.filters import KEPT
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.content.data import read_recording
-from spherloc_viz.recording.reviews import Review, read_review
+from spherloc_viz.recording.review_file import read_review
+from spherloc_viz.recording.reviews import Review
 from spherloc_viz.recording.run_row import RunRow
 from tests.reviewing_pages import Office, recorded_twice
 from tests.tiny_scene import write_tiny_scene

@@ -33,7 +33,8 @@ from spherloc_viz.app.web.viewer import (
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.rerun_program import viewer_version
-from spherloc_viz.recording.reviews import review_path, write_review
+from spherloc_viz.recording.review_file import write_review
+from spherloc_viz.recording.reviews import review_path
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.viewer import step_of
 from tests.waiting import LIMIT_S

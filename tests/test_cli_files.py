@@ -13,7 +13,7 @@ from spherloc.datasets import bundled_scenes, load_scene, scene_path
 from spherloc.estimators import estimate
 from spherloc_viz.given_files import without_reviews
 from spherloc_viz.recording.content.writer import write_recording
-from spherloc_viz.recording.reviews import write_review
+from spherloc_viz.recording.review_file import write_review
 
 
 @pytest.mark.usefixtures("own_examiner")

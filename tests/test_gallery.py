@@ -22,7 +22,8 @@ from spherloc_viz.gallery.case import Played, agrees, faults, loose_numbers, pla
 from spherloc_viz.gallery.file import parse_gallery
 from spherloc_viz.gallery.regenerate import chosen, outcome, record, stories
 from spherloc_viz.recording.content.data import read_recording
-from spherloc_viz.recording.reviews import Review, read_review, review_path, write_review
+from spherloc_viz.recording.review_file import read_review, write_review
+from spherloc_viz.recording.reviews import Review, review_path
 from spherloc_viz.recording.viewer import labels_of
 
 KEYS = [case.key for case in gallery_cases()]

@@ -24,7 +24,7 @@ from spherloc_viz.commands.run import Records
 from spherloc_viz.options import usable_estimators
 from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.replay import repeat
-from spherloc_viz.recording.reviews import read_review
+from spherloc_viz.recording.review_file import read_review
 
 NAME = "mei_outliers_80"
 

@@ -30,7 +30,8 @@ from spherloc_viz.recording.content import data
 from spherloc_viz.recording.content.components import LEVEL_OPACITY
 from spherloc_viz.recording.content.data import check_recording, read_recording
 from spherloc_viz.recording.content.drawing import WORDS
-from spherloc_viz.recording.content.properties import APPLICATION_ID, FORMAT_VERSION, legible
+from spherloc_viz.recording.content.names import APPLICATION_ID, FORMAT_VERSION
+from spherloc_viz.recording.content.texts import legible
 from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 from spherloc_viz.recording.origin import machine
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment

@@ -22,7 +22,7 @@ from spherloc_viz.recording.content.data import read_recording, read_run_row
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.replay import compare
-from spherloc_viz.recording.reviews import write_review
+from spherloc_viz.recording.review_file import write_review
 from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError
 from spherloc_viz.recording.storage.recorder import Recorder
 from spherloc_viz.recording.storage.store import RecordingStore, Recovered, recover

@@ -22,12 +22,13 @@ from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.key_step import key_step, step_pose
 from spherloc_viz.recording.content.components import HEIGHT_PX, LONGEST_PX, MATCHES, WIDTH_PX, thumbnail
-from spherloc_viz.recording.content.data import MAX_SCENE_BYTES, NUMBERS, read_recording, read_run_row, scene_text
+from spherloc_viz.recording.content.data import MAX_SCENE_BYTES, read_recording, read_run_row, scene_text
 from spherloc_viz.recording.content.head import read_head
-from spherloc_viz.recording.content.properties import FORMAT_VERSION, MAX_CHARACTERS, problem_key
+from spherloc_viz.recording.content.names import FORMAT_VERSION, NUMBERS
 from spherloc_viz.recording.content.writer import recorded_steps, write_recording
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.reviews import write_review
+from spherloc_viz.recording.review_file import write_review
+from spherloc_viz.recording.run_summary import MAX_CHARACTERS, problem_key
 from tests.needs import needs
 
 FORMAT_1, FORMAT_2, FORMAT_3 = (Path(__file__).parent / "data" / f"format_{version}.rrd" for version in (1, 2, 3))

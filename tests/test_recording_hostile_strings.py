@@ -28,7 +28,8 @@ from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.index.run_text import counts_text, rows_text
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.reviews import review_path, write_review
+from spherloc_viz.recording.review_file import write_review
+from spherloc_viz.recording.reviews import review_path
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import examine
 

@@ -25,8 +25,9 @@ from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Chart, Curve, Picture
 from spherloc_viz.recording.content.columns import Values, static_chunk
 from spherloc_viz.recording.content.layout import append, layout_file, shown_in, split, xxh32
+from spherloc_viz.recording.content.names import APPLICATION_ID, REVIEW_ENTITY
 from spherloc_viz.recording.content.panels import MAX_EDGES, MAX_NODES, panel_chunks, panels_of
-from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY, legible
+from spherloc_viz.recording.content.texts import legible
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
 from spherloc_viz.recording.run_row import RunRow

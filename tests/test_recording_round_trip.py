@@ -15,10 +15,11 @@ from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.reviews import checked_review, write_review
+from spherloc_viz.recording.review_file import write_review
+from spherloc_viz.recording.reviews import checked_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.sandbox.checks import row_from_table, table_from_row
 from spherloc_viz.recording.sandbox.examiner import examine
+from spherloc_viz.recording.sandbox.row_checks import row_from_table, table_from_row
 
 pytestmark = pytest.mark.usefixtures("own_examiner")
 

@@ -39,9 +39,10 @@ from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
 from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.content.writer import write_recording
-from spherloc_viz.recording.reviews import Review, review_path, write_review
+from spherloc_viz.recording.review_file import write_review
+from spherloc_viz.recording.reviews import Review, review_path
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.sandbox import checks
+from spherloc_viz.recording.sandbox import content_checks
 from spherloc_viz.recording.sandbox import examiner as examiners
 from spherloc_viz.recording.sandbox.child import FILE_LIMIT_BYTES
 from spherloc_viz.recording.sandbox.examiner import Examiner, examine, examine_all
@@ -354,5 +355,5 @@ def test_fields_whose_types_are_aliases_are_checked_too() -> None:
     array = TypeAliasType("array", np.ndarray[Any, np.dtype[item]], type_params=(item,))  # type: ignore[misc]
     whole = TypeAliasType("whole", int)
     for hint in (array, array[np.float64], array[np.float64] | None):
-        assert checks._fits(np.zeros(3), hint) and not checks._fits([0.0], hint)
-    assert checks._fits(3, whole) and not checks._fits(3.0, whole)
+        assert content_checks._fits(np.zeros(3), hint) and not content_checks._fits([0.0], hint)
+    assert content_checks._fits(3, whole) and not content_checks._fits(3.0, whole)

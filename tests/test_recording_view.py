@@ -20,7 +20,8 @@ from spherloc.estimators import estimate
 from spherloc_viz.app.web.viewer import serve_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
-from spherloc_viz.recording.reviews import review_path, write_review
+from spherloc_viz.recording.review_file import write_review
+from spherloc_viz.recording.reviews import review_path
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.viewer import labels_of, stand_at, view_in_window
 from tests.needs import needs, vulkan

@@ -13,9 +13,10 @@ from spherloc.errors import RecordingError
 from spherloc.estimators import estimate, options_type
 from spherloc.trace import Trace
 from spherloc_viz.app.catalog import Catalog, SceneRequest
-from spherloc_viz.recording.content.data import RecordedRun, read_recording
+from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.recorded_run import RecordedRun
 from spherloc_viz.recording.replay import RecordedScene, Reopened, compare, reopen
 from tests.datasets.test_rendered import SMALL
 

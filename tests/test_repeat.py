@@ -17,9 +17,10 @@ from spherloc.estimators import estimate, options_type
 from spherloc.trace import Certificate, Trace
 from spherloc_viz.commands.run import Records, run_scenes
 from spherloc_viz.recording import replay as repeating
-from spherloc_viz.recording.content.data import RecordedRun, read_recording
+from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.recorded_run import RecordedRun
 from spherloc_viz.recording.replay import (
     as_record,
     as_text,

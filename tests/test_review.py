@@ -8,18 +8,16 @@ from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 from spherloc.errors import InputError, RecordingError
-from spherloc_viz.recording import reviews
-from spherloc_viz.recording.content.properties import APPLICATION_ID
+from spherloc_viz.recording import review_file
+from spherloc_viz.recording.content.names import APPLICATION_ID
+from spherloc_viz.recording.review_file import MAX_BYTES, read_review, write_review
 from spherloc_viz.recording.reviews import (
-    MAX_BYTES,
     MAX_LABEL_CHARACTERS,
     MAX_LABELS,
     MAX_NOTE_CHARACTERS,
     Review,
     checked_review,
-    read_review,
     review_path,
-    write_review,
 )
 
 
@@ -89,7 +87,7 @@ def test_a_review_that_is_removed_or_replaced_while_it_is_read(
 ):
     run = tmp_path / "run.rrd"
     write_review(run, ["a"], "", run_id="1")
-    read, calls = reviews.read_file, []
+    read, calls = review_file.read_file, []
 
     def slow(path: Path, most_labels: int) -> tuple[list[str], str]:
         """As another process may do between the opening of a file and its end."""
@@ -99,7 +97,7 @@ def test_a_review_that_is_removed_or_replaced_while_it_is_read(
             raise RuntimeError("No such file or directory")
         return read(path, most_labels)
 
-    monkeypatch.setattr(reviews, "read_file", slow)
+    monkeypatch.setattr(review_file, "read_file", slow)
     assert read_review(run) == then
 
 

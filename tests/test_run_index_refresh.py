@@ -13,7 +13,7 @@ from run_rows import some_row
 from spherloc.errors import RecordingError
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.reviews import read_review, write_review
+from spherloc_viz.recording.review_file import read_review, write_review
 from spherloc_viz.recording.run_row import RunRow
 
 

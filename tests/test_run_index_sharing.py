@@ -18,7 +18,8 @@ from spherloc.estimators import estimate
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
-from spherloc_viz.recording.reviews import Review, read_review, review_path
+from spherloc_viz.recording.review_file import read_review
+from spherloc_viz.recording.reviews import Review, review_path
 from spherloc_viz.recording.viewer import labels_of
 from tests.waiting import LIMIT_S
 

@@ -22,7 +22,8 @@ from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.index.run_text import WIDTH, counts_text, rows_text
 from spherloc_viz.recording.index.steps import find_steps
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.reviews import Review, read_review, write_review
+from spherloc_viz.recording.review_file import read_review, write_review
+from spherloc_viz.recording.reviews import Review
 from spherloc_viz.recording.run_row import RunRow
 
 

@@ -14,7 +14,7 @@ from spherloc_viz.commands.run import Records
 from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
-from spherloc_viz.recording.reviews import write_review
+from spherloc_viz.recording.review_file import write_review
 
 SPOILED = {"iterations": 1}
 """Options with which RANSAC fails."""

@@ -219,6 +219,16 @@ def test_the_command_line_answers_before_anything_large_is_loaded():
     assert not told_by(scenes + LOADER.format(names=[])) & large
 
 
+def test_the_first_picture_waits_for_nothing_that_it_does_not_need():
+    """Recordings and lessons come later, and what they need takes a fifth of all imports: see what the functions that
+    read and write them import themselves."""
+    later = {"rerun", "rerun_bindings", "pyarrow", "markdown_it", "latex2mathml"}
+    assert later <= loaded_by(["spherloc_viz.recording.content.writer", "spherloc_viz.app.lesson_file"])
+    loaded = loaded_by(["spherloc_viz.app.server"])
+    assert "viser" in loaded
+    assert not loaded & later, f"the server also loads {', '.join(sorted(loaded & later))}: import it where it is used"
+
+
 def test_every_import_goes_down():
     broken = []
     for module in MODULES:

@@ -247,7 +247,7 @@ def _write_recordings(folder: Path) -> None:
     from spherloc.datasets import bundled_scenes, load_scene
     from spherloc.estimators import estimate
     from spherloc_viz.recording.content.writer import write_recording
-    from spherloc_viz.recording.reviews import write_review
+    from spherloc_viz.recording.review_file import write_review
 
     problem = load_scene(bundled_scenes()["mei_outliers_80"]).problem()
     for estimator in ("mc", "mc-exact", "ransac-2p"):

@@ -15,7 +15,8 @@ from spherloc.warm_up import warm_up
 from spherloc_viz.gallery.case import Beside, GalleryCase, Played, faults, origin_of, play
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.reviews import has_review, write_review
+from spherloc_viz.recording.review_file import write_review
+from spherloc_viz.recording.reviews import has_review
 from spherloc_viz.recording.sandbox.examiner import examine, examine_review
 
 WIDTH = 100

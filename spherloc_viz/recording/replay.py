@@ -21,8 +21,8 @@ from spherloc.types import FloatArray
 from spherloc.warm_up import warm_up
 from spherloc_viz.given_files import check_recording_file, is_recording
 from spherloc_viz.options import OptionField, json_text, option_fields
-from spherloc_viz.recording.content.data import RecordedRun, read_recording
 from spherloc_viz.recording.origin import Origin, Source, machine
+from spherloc_viz.recording.recorded_run import RecordedRun
 from spherloc_viz.recording.sandbox.examiner import examine
 
 
@@ -58,6 +58,9 @@ def load_recorded_scene(path: Path) -> RecordedScene:
     path = Path(path)
     check_recording_file(path)
     examine(path)
+    # Here, since it imports rerun, which takes a quarter of a second: a page should not wait for it.
+    from spherloc_viz.recording.content.data import read_recording
+
     return RecordedScene(read_recording(path), path)
 
 

@@ -8,11 +8,8 @@ import sys
 import time
 from pathlib import Path
 
-from rerun.chunk import RrdReader
-from rerun.experimental import ViewerClient
-
 from spherloc.errors import InputError, RecordingError
-from spherloc_viz.recording.content.columns import TIMELINE
+from spherloc_viz.recording.content.names import TIMELINE
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
 from spherloc_viz.recording.reviews import Review, review_path
 from spherloc_viz.recording.run_row import RunRow
@@ -45,6 +42,9 @@ def labels_of(recording: Path, run_id: str) -> Path | None:
     path = review_path(recording)
     if examine_review(recording) == Review():
         return None
+    # Here, since rerun takes a quarter of a second to import: a page should not wait for it.
+    from rerun.chunk import RrdReader
+
     if {entry.recording_id for entry in RrdReader(path).recordings()} != {run_id}:
         raise RecordingError(f"{path}: labels and note of another run; delete the file and label this one.")
     return path
@@ -71,6 +71,8 @@ def view_in_window(path: Path, row: RunRow, step: int) -> None:
 def stand_at(viewer: subprocess.Popen[bytes], address: str, place: int) -> bool:
     """Tell a viewer that is starting to pause at a place of the timeline as soon as it has its recording; False if it
     never takes it."""
+    from rerun.experimental import ViewerClient  # here for the same reason
+
     for _ in range(TRIES):
         if viewer.poll() is not None:
             return False

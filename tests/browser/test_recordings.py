@@ -13,7 +13,7 @@ from playground import PATIENCE_MS, SCENE, Playground, served
 from playwright.sync_api import Browser, Locator, expect
 
 from spherloc_viz.recording.content.data import read_run_row
-from spherloc_viz.recording.reviews import read_review
+from spherloc_viz.recording.review_file import read_review
 
 
 @pytest.fixture(scope="module")

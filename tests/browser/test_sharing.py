@@ -17,7 +17,8 @@ from spherloc.estimators import estimate
 from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.controls.presets import RECIPES, presets
 from spherloc_viz.layers.outcome import outcome_table
-from spherloc_viz.recording.content.data import RecordedRun, read_recording
+from spherloc_viz.recording.content.data import read_recording
+from spherloc_viz.recording.recorded_run import RecordedRun
 from tests.waiting import LIMIT_S
 
 OUTCOMES = {

@@ -16,7 +16,7 @@ from spherloc.datasets import load_scene
 from spherloc.estimators import default_options, estimate
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
-from spherloc_viz.recording.reviews import read_review
+from spherloc_viz.recording.review_file import read_review
 from tests.waiting import until
 
 WRONG = (0, 3, 4, 5)

@@ -17,7 +17,7 @@ from spherloc_viz import style
 from spherloc_viz.app.web.viewer import viewer_link
 from spherloc_viz.recording.content.data import read_run_row
 from spherloc_viz.recording.content.writer import write_recording
-from spherloc_viz.recording.reviews import write_review
+from spherloc_viz.recording.review_file import write_review
 from spherloc_viz.recording.run_row import RunRow
 from tests.waiting import until
 

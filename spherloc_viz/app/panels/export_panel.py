@@ -20,7 +20,6 @@ from spherloc_viz.app.stage.still_page import Still, still_html, viewpoint
 from spherloc_viz.app.text import DIM, begun, box, status_html
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.layers.primitives import SceneItem
-from spherloc_viz.recording.content.writer import write_recording
 
 VIEW = "Share"
 """Name by which the page reports whether the panel can be seen."""
@@ -136,6 +135,9 @@ class ExportPanel:
             self._send(name, shown.recorded.read_bytes())
             return
         self._say("Writing the recording …")
+        # Here, since it imports rerun, which takes a quarter of a second: a page should not wait for it.
+        from spherloc_viz.recording.content.writer import write_recording
+
         with tempfile.TemporaryDirectory(prefix="spherloc-") as folder:
             path = Path(folder) / "run.rrd"
             write_recording(shown.trace, path)

@@ -17,8 +17,8 @@ from spherloc_viz.app.review.rows import NEXT_KEY, PREVIOUS_KEY, badge_html, ver
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.viewer import viewer_link
 from spherloc_viz.layers import steps
-from spherloc_viz.recording.content.properties import outcome
 from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.run_summary import outcome
 
 GROUND = "margin:0 .6em .4em;border:1px solid rgba(80,150,250,.45);border-radius:.4em"
 

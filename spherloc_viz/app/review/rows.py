@@ -12,7 +12,7 @@ from spherloc_viz.app.review.filters import PAGE, Look, keep_html, key_html, key
 from spherloc_viz.app.text import DIM, box, dot_html
 from spherloc_viz.app.web.viewer import viewer_link
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.sandbox.checks import is_thumbnail
+from spherloc_viz.recording.sandbox.row_checks import is_thumbnail
 
 DESK = "/desk"
 """Address of the desk (``app/web/desk.py``)."""

@@ -10,9 +10,9 @@ from typing import Any
 
 from spherloc.errors import RecordingError
 from spherloc_viz.app.review.filters import EXACT, JUDGED, PAGE, Counts, Look
-from spherloc_viz.recording.content.data import RecordedRun, read_recording
 from spherloc_viz.recording.index.query import MAX_TEXT, RunQuery
 from spherloc_viz.recording.index.run_index import Found, RunIndex
+from spherloc_viz.recording.recorded_run import RecordedRun
 from spherloc_viz.recording.reviews import Review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import examine, resolve_inside
@@ -94,6 +94,9 @@ class RunLibrary:
         """A recording that another process has found safe to be read; raises ``RecordingError`` if it is not."""
         path = resolve_inside(self.folder, file)
         examine(path)
+        # Here, since it imports rerun, which takes a quarter of a second: a page should not wait for it.
+        from spherloc_viz.recording.content.data import read_recording
+
         return read_recording(path), path
 
     def prepare(self) -> None:

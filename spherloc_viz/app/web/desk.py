@@ -27,7 +27,7 @@ from spherloc_viz.app.web.downloads import Download, Downloads
 from spherloc_viz.app.web.viewer import viewer_link
 from spherloc_viz.layers.primitives import true_minus
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.sandbox.checks import is_thumbnail
+from spherloc_viz.recording.sandbox.row_checks import is_thumbnail
 
 DO = f"{DESK}/do"
 """The only address that takes a POST."""

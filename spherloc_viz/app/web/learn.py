@@ -9,10 +9,7 @@ from collections.abc import Callable
 from aiohttp import web
 
 from spherloc.errors import InputError
-from spherloc_viz.app.lesson_file import handout_of, images_picture, picture
 from spherloc_viz.app.web.access import SAFE, SORRY_POLICY, sorry_page
-from spherloc_viz.lessons import lesson_named, lessons
-from spherloc_viz.lessons.html import IMAGES, lesson_page, list_page, notes_page, teacher_page
 
 LEARN = "/learn"
 PICTURES = f"{LEARN}/pictures/"
@@ -27,6 +24,11 @@ def is_learning(path: str) -> bool:
 
 async def learn_answer(request: web.Request) -> web.Response:
     """The list, a lesson, or a picture, for a request that the front door has checked."""
+    # Here, since they import what sets texts and formulas, which the first picture of the playground needs none of.
+    from spherloc_viz.app.lesson_file import handout_of, images_picture, picture
+    from spherloc_viz.lessons import lesson_named, lessons
+    from spherloc_viz.lessons.html import IMAGES, lesson_page, list_page, notes_page, teacher_page
+
     path = request.path
     if path.startswith(PICTURES):
         name = path.removeprefix(PICTURES)

@@ -19,7 +19,7 @@ from aiohttp import web
 from spherloc.errors import InputError, RecordingError, SpherlocError, show
 from spherloc_viz.app.web.access import SAFE, SORRY_POLICY, open_socket, refusal, sorry_page
 from spherloc_viz.given_files import REVIEW_SUFFIX
-from spherloc_viz.recording.content.columns import TIMELINE
+from spherloc_viz.recording.content.names import TIMELINE
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.rerun_program import NAMES, viewer_folder, viewer_version
 from spherloc_viz.recording.reviews import reviewed_name

@@ -12,8 +12,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
-TIMELINE = "step"
-"""The sequence timeline of every recording: the number of the step in ``layers.steps``, from 1, as on the page."""
+from spherloc_viz.recording.content.names import TIMELINE
 
 MARKDOWN = "text/markdown"
 """Media type of texts."""

@@ -39,7 +39,8 @@ from spherloc_viz.recording.content.columns import (
     strips,
     vectors,
 )
-from spherloc_viz.recording.content.properties import QUERY_IMAGE, legible, step_text, table_text
+from spherloc_viz.recording.content.names import QUERY_IMAGE
+from spherloc_viz.recording.content.texts import legible, step_text, table_text
 
 MATCHES = "/query/matches"
 """Keypoints of all matches, in the colours of the step."""

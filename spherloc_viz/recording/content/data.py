@@ -12,7 +12,7 @@ import json
 import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,24 +29,25 @@ from spherloc.diagnosis import Cause, Diagnosis, Measures
 from spherloc.errors import InputError, RecordingError, show
 from spherloc.problem import Problem
 from spherloc.trace import Certificate, Trace
-from spherloc.types import BoolArray, FloatArray
 from spherloc_viz.given_files import check_recording_file
 from spherloc_viz.layers.key_step import StepNumbers
 from spherloc_viz.options import plain
 from spherloc_viz.recording.content.columns import Times, Values, static_chunk
-from spherloc_viz.recording.content.properties import (
+from spherloc_viz.recording.content.names import (
     APPLICATION_ID,
+    ARRAYS,
+    DATA,
     FORMAT_VERSION,
+    NUMBERS,
     OLDEST_VERSION,
+    PROPERTIES,
     QUERY_IMAGE,
-    RUN_PROPERTY,
     THUMBNAIL_PROPERTY,
-    read_image,
-    read_properties,
-    row_from_properties,
 )
+from spherloc_viz.recording.content.properties import read_image, read_properties, row_from_properties
 from spherloc_viz.recording.origin import Origin, machine
-from spherloc_viz.recording.reviews import read_review
+from spherloc_viz.recording.recorded_run import RecordedRun
+from spherloc_viz.recording.review_file import read_review
 from spherloc_viz.recording.run_row import RunRow
 
 MAX_ARRAY_BYTES = 16_384
@@ -54,8 +55,6 @@ MAX_ARRAY_BYTES = 16_384
 MAX_SCENE_BYTES = 65_536
 """The text of a larger scene file is not recorded."""
 
-DATA = "/data"
-ARRAYS = "arrays"
 STORED_AS = {"nfa": "chance_sets", "alternative_cam_from_map": "rival_cam_from_map"}
 """Fields that recordings know by the name that they had in the first format."""
 NOT_FINITE = "number"
@@ -245,8 +244,6 @@ def _numpy(values: pa.Array) -> NDArray[Any]:
     return array
 
 
-NUMBERS = "/numbers"
-"""Its columns are the fields of ``StepNumbers``."""
 TYPES = {
     "stage": pa.utf8(),
     "key": pa.utf8(),
@@ -268,49 +265,7 @@ def numbers_chunk(numbers: Sequence[StepNumbers]) -> Chunk:
 
 
 STAGES = "stages/"
-PROPERTIES = f"/__properties/{RUN_PROPERTY}"
 THUMBNAIL = f"/__properties/{THUMBNAIL_PROPERTY}"
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedRun:
-    """A run as its recording has it."""
-
-    row: RunRow
-    """What lists show."""
-    properties: Mapping[str, Any]
-    """The same as it is written, which queries of Rerun's catalog see, without what is unknown; beside it ``versions``
-    (JSON) and, of runs with a certificate, upper_bound, lower_bound and chance_sets."""
-    problem: Problem
-    """What was solved, equal to the original in every bit."""
-    estimator: str
-    """Registered name."""
-    options: Mapping[str, Any]
-    """Fields of the estimator's options."""
-    seed: int
-    """Seed of every random draw."""
-    versions: Mapping[str, str]
-    """Versions of spherloc, python and the numeric libraries that computed it, and the machine."""
-    timings_ms: Mapping[str, float]
-    """Wall time a stage, and ``total``."""
-    cam_from_map: FloatArray | None
-    """Estimated pose (3, 4), or None."""
-    inlier_mask: BoolArray
-    """(N,) correspondences within the bound of the estimated pose."""
-    message: str
-    """The outcome in one sentence."""
-    stages: Mapping[str, Mapping[str, Any]]
-    """Fields of each stage by its kind; a lean recording has no large arrays, which follow from the rest."""
-    certificate: Certificate | None
-    """What is proven about the consensus; None if nothing is, as in recordings older than certificates."""
-    origin: Origin | None
-    """Where the run came from; None in recordings of format 1."""
-    scene_text: str | None
-    """The scene file as it was; None if there was none, or none of moderate size."""
-    diagnosis: Diagnosis | None
-    """The diagnosis of the run; None in recordings of format 1."""
-    query_image: bytes | None
-    """The query image as it is shown, a JPEG; None if there was none to be read."""
 
 
 def read_recording(path: Path) -> RecordedRun:

@@ -15,16 +15,14 @@ from typing import Any
 
 import pyarrow as pa
 
-from spherloc_viz.recording.content.properties import (
+from spherloc_viz.recording.content.names import (
     APPLICATION_ID,
     FORMAT_VERSION,
     OLDEST_VERSION,
     RUN_PROPERTY,
     THUMBNAIL_PROPERTY,
-    read_image,
-    read_properties,
-    row_from_properties,
 )
+from spherloc_viz.recording.content.properties import read_image, read_properties, row_from_properties
 from spherloc_viz.recording.run_row import RunRow
 
 MAX_HEAD_BYTES = 1 << 16

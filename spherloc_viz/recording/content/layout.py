@@ -27,8 +27,9 @@ from rerun.blueprint import archetypes
 from spherloc.kernel_cache import kernel
 from spherloc_viz.layers.primitives import Chart, Picture
 from spherloc_viz.recording.content.drawing import chart_path, table_path
+from spherloc_viz.recording.content.names import APPLICATION_ID, REVIEW_ENTITY
 from spherloc_viz.recording.content.panels import ARCS, GRAPH, RESIDUALS, Panels
-from spherloc_viz.recording.content.properties import APPLICATION_ID, REVIEW_ENTITY, legible
+from spherloc_viz.recording.content.texts import legible
 
 HEADER_BYTES = 12
 END, CHUNK = 0, 2

@@ -23,10 +23,13 @@ from spherloc_viz.recording.content.components import image_chunks, query_image,
 from spherloc_viz.recording.content.data import data_chunk, numbers_chunk
 from spherloc_viz.recording.content.drawing import drawing_chunks
 from spherloc_viz.recording.content.layout import append, layout_file, shown_in
+from spherloc_viz.recording.content.names import APPLICATION_ID
 from spherloc_viz.recording.content.panels import Panels, panel_chunks, panels_of
-from spherloc_viz.recording.content.properties import APPLICATION_ID, outcome_text, property_chunks, run_row
+from spherloc_viz.recording.content.properties import property_chunks
+from spherloc_viz.recording.content.texts import outcome_text
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.run_summary import run_row
 from spherloc_viz.recording.storage.unfinished import unfinished
 
 EXPLAINING = frozenset(

@@ -34,7 +34,7 @@ from spherloc_viz.recording.index.refresher import (
     same_recording,
     stamp_of,
 )
-from spherloc_viz.recording.reviews import Review, write_review
+from spherloc_viz.recording.reviews import Review
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.sandbox.examiner import Examiners, Result, check_name, examine
 
@@ -229,6 +229,9 @@ class RunIndex:
         Of two pages that do so at once the last one wins. Raises ``RecordingError`` if there is no such run or the
         review cannot be written, ``InputError`` if it is too long.
         """
+        # Here, since it imports rerun, which takes a quarter of a second: a page should not wait for it.
+        from spherloc_viz.recording.review_file import write_review
+
         path = self.folder / check_name(file)
 
         def work(connection: sqlite3.Connection) -> Review | None:

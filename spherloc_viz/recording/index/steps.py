@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from spherloc.errors import InputError, RecordingError, show
 from spherloc.registry import require
-from spherloc_viz.recording.content.data import NUMBERS
+from spherloc_viz.recording.content.names import NUMBERS
 from spherloc_viz.recording.index.run_text import csv_text, json_lines, number_text, one_line
 from spherloc_viz.recording.run_row import COUNTED_FROM_1, STORED_AS, RunRow
 

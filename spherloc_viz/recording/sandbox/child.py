@@ -24,10 +24,12 @@ from rerun.error_utils import RerunWarning
 from spherloc.errors import RecordingError, SpherlocError
 from spherloc_viz.recording.content.data import check_recording, read_recording
 from spherloc_viz.recording.content.head import read_head
-from spherloc_viz.recording.content.properties import APPLICATION_ID
-from spherloc_viz.recording.reviews import has_review, read_review
+from spherloc_viz.recording.content.names import APPLICATION_ID
+from spherloc_viz.recording.review_file import read_review
+from spherloc_viz.recording.reviews import has_review
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.sandbox.checks import check_content, check_run, row_from_table, table_from_row
+from spherloc_viz.recording.sandbox.content_checks import check_content, check_run
+from spherloc_viz.recording.sandbox.row_checks import row_from_table, table_from_row
 
 try:
     import resource

@@ -22,7 +22,7 @@ from spherloc.errors import InputError, RecordingError, show
 from spherloc_viz.recording.rerun_program import rerun_environment
 from spherloc_viz.recording.reviews import UNREADABLE, Review, checked_review, has_review, review_path
 from spherloc_viz.recording.run_row import RunRow
-from spherloc_viz.recording.sandbox.checks import row_from_table
+from spherloc_viz.recording.sandbox.row_checks import row_from_table
 
 LINE_LIMIT_BYTES = 1 << 22
 """Longest answer: it has up to ``AT_ONCE`` rows, each with a thumbnail of some kilobytes."""

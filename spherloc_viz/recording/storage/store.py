@@ -21,14 +21,13 @@ from spherloc.experiments.sweep import Job, SweepPlan
 from spherloc.trace import Trace
 from spherloc_viz.given_files import REVIEW_SUFFIX
 from spherloc_viz.options import json_text
-from spherloc_viz.recording.content.properties import problem_key
-from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import PAGE_KEPT, RunQuery
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.origin import Origin, Source
 from spherloc_viz.recording.rerun_program import rerun_command, rerun_environment
 from spherloc_viz.recording.reviews import has_review
 from spherloc_viz.recording.run_row import RunRow
+from spherloc_viz.recording.run_summary import problem_key
 from spherloc_viz.recording.sandbox.examiner import Examiner, ExaminerError, Examiners, examine_review
 from spherloc_viz.recording.storage.room import GALLERY, KEEP_BYTES, size_words
 from spherloc_viz.recording.storage.unfinished import here, leftovers, target_of, unfinished
@@ -289,6 +288,9 @@ class RecordingStore:
         A run that is recorded anew, to the same ``path`` and with the same ``run_id``, keeps its labels and note.
         Raises ``RecordingError`` if it cannot be written. What else fails is a notice: the recording is there.
         """
+        # Here, since it imports rerun, which takes a quarter of a second: a page should not wait for it.
+        from spherloc_viz.recording.content.writer import write_recording
+
         path = self.path_of(trace) if path is None else path
         row = write_recording(trace, path, origin, diagnosis, self._full, run_id)
         if has_review(path):
