@@ -53,8 +53,9 @@ def photographs(
     """The images of a folder or, if it has none, of the folders in it, with their cameras.
 
     ``cameras`` are those of a calibration file, by name; without them, calibrations beside the images are taken, and
-    for a folder in ``folder`` also one beside it that has its name. A single camera is that of all images. Of several
-    with the size of an image it is the one whose name is in the image's name, or that of its folder. Images of 2 to 1
+    for a folder in ``folder`` also one beside it that has its name, or a file there with several cameras. A single
+    camera is that of all images. Of several with the size of an image it is the one whose name is in the image's name,
+    or that of its folder; a camera that has only a number is that of the folder with this number. Images of 2 to 1
     count as panoramas where no camera has their size, and if ``panorama`` in any case. Pixels that ``masks`` leave out
     give no features.
 
@@ -68,13 +69,15 @@ def photographs(
     views: list[View] = []
     remarks: list[str] = []
     if any(is_image(name) for name in there) or not inside:
-        views, remarks = _of_folder(folder, "", cameras, panorama)
+        views, remarks = _of_folder(folder, "", cameras, {}, panorama)
         remarks += _about_subfolders(inside)
     else:
-        for name in sorted(inside):
+        folders = sorted(inside)
+        shared = _of_files([folder / name for name in there], least=2)
+        for name in folders:
             try:
-                own = {name: cameras[name]} if name in cameras else cameras
-                found, about = _of_folder(folder, name, own, panorama)
+                given, beside = (_belonging(some, name, folders) for some in (cameras, shared))
+                found, about = _of_folder(folder, name, given, beside, panorama)
             except InputError as error:
                 found, about = [], [f"It is left out: {error}"]
             views += found
@@ -95,10 +98,25 @@ def photographs(
     return Photographs(tuple(views), tuple(remarks))
 
 
-def _of_folder(root: Path, inside: str, given: Mapping[str, Camera], panorama: bool) -> tuple[list[View], list[str]]:
+def _belonging(cameras: Mapping[str, Camera], folder: str, folders: Sequence[str]) -> Mapping[str, Camera]:
+    """The camera that has the name of a folder, or its number if every folder has that of one; else all."""
+    if folder in cameras:
+        return {folder: cameras[folder]}
+    of_number = {int(name): name for name in cameras if name.isdigit()}
+    numbers = {name: int(found[0]) for name in folders if len(found := re.findall(r"[0-9]+", name)) == 1}
+    if len(set(numbers.values()) & of_number.keys()) == len(folders):
+        name = of_number[numbers[folder]]
+        return {name: cameras[name]}
+    return cameras
+
+
+def _of_folder(
+    root: Path, inside: str, given: Mapping[str, Camera], shared: Mapping[str, Camera], panorama: bool
+) -> tuple[list[View], list[str]]:
     """The images of the folder ``inside`` of ``root``, or of ``root`` itself if that is empty, and remarks on others.
 
-    Raises ``InputError`` if it has none, or if their camera is unknown or has no model in COLMAP.
+    ``given`` are the cameras that the user gave, ``shared`` those of files for all folders. Raises ``InputError`` if it
+    has none, or if their camera is unknown or has no model in COLMAP.
     """
     folder = root / inside
     sizes: dict[tuple[int, int], list[str]] = {}
@@ -114,7 +132,7 @@ def _of_folder(root: Path, inside: str, given: Mapping[str, Camera], panorama: b
     remarks = [*_about_damaged(damaged), *_about_unread(others)]
     if not sizes:
         raise InputError(_without_photographs(folder, remarks))
-    cameras = given if given or panorama else _beside(root, inside)
+    cameras = given if given or panorama else _beside(root, inside) or shared
     camera_of: dict[str, Camera] = {}
     for size, names in sizes.items():
         found, about = _with_cameras(names, size, cameras)
@@ -186,16 +204,23 @@ def _is_in(camera: str, image: str) -> bool:
 
 
 def _beside(root: Path, inside: str) -> dict[str, Camera]:
-    """Cameras of the calibration files in a folder, and of one beside it that has its name, by the name of the file or,
-    if it has several, of the camera in it."""
+    """Cameras of the calibration files in a folder, and of one beside it that has its name."""
     files = [root / inside / name for name in names_in(root / inside)]
     files += [root / name for name in names_in(root) if inside and Path(name).stem == inside]
+    return _of_files(files)
+
+
+def _of_files(files: Sequence[Path], least: int = 1) -> dict[str, Camera]:
+    """Cameras of those of the files that are calibrations of at least so many cameras, by the name of the file or, if
+    it has several, of the camera in it."""
     found: dict[str, Camera] = {}
     for path in [path for path in files if path.suffix.lower() in CALIBRATIONS][:MAX_CALIBRATIONS]:
         try:
             names = camera_names(path)
-            many = {name: load_camera(path, name) for name in names} if len(names) > 1 else {}
-            found |= many or {path.stem: load_camera(path)}
+            if len(names) > 1:
+                found |= {name: load_camera(path, name) for name in names}
+            elif least <= 1:
+                found[path.stem] = load_camera(path)
         except SpherlocError:  # not a calibration
             continue
     return found

@@ -1,4 +1,4 @@
-"""COLMAP's cameras.txt as a calibration file."""
+"""COLMAP's cameras.txt and kapture's sensors.txt as calibration files."""
 
 import pytest
 
@@ -46,3 +46,24 @@ def test_a_map_gets_the_cameras_of_a_file_by_name(tmp_path):
     assert list(found) == ["1", "3"] and found["1"] == FIRST
     assert list(cameras_of_file(path, "3").values()) == [found["3"]]
     assert cameras_of_file(None, None) == {}
+
+
+KAPTURE = """# kapture format: 1.1
+# sensor_id, name, sensor_type, [sensor_params]+
+left, the left one, camera, OPENCV_FISHEYE, 848, 800, 284.5, 285.5, 424.4, 393.7, 0.001, 0.031, -0.03, 0.005
+right, , camera, UNKNOWN_CAMERA, 848, 800
+imu, , accelerometer
+"""
+
+
+def test_the_cameras_among_the_sensors_of_kapture(tmp_path):
+    """Those with a calibration; a file of kapture that has none is no calibration."""
+    path = tmp_path / "sensors.txt"
+    path.write_text(KAPTURE)
+    assert camera_names(path) == ("left",) and load_camera(path) == load_camera(path, "left") == FIRST
+    with pytest.raises(CalibrationError, match=r"sensors\.txt: has no camera 'right': choose one of left\.$"):
+        load_camera(path, "right")
+    for broken in (KAPTURE.replace("848, 800, 284.5", "wide, 800, 284.5"), "# kapture format: 1.1\nimu, , gyroscope"):
+        path.write_text(broken)
+        with pytest.raises(CalibrationError, match=r"kapture's sensors\.txt"):
+            load_camera(path)

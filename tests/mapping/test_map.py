@@ -23,7 +23,7 @@ from spherloc.mapping.make import ScaleMeasurement, make_map, scale_of
 from spherloc.mapping.photographs import _is_in, frames_of, photographs, two_circles
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
 from spherloc.problem import Problem
-from spherloc_viz.commands.map import _kind, main, map_report, summary
+from spherloc_viz.commands.map import _kind, cameras_of_file, main, map_report, summary
 
 IMAGES = ("reference_002", "reference_003", "reference_004", "reference_005", "reference_006")
 
@@ -199,6 +199,34 @@ def test_each_image_of_a_rig_has_its_camera(tmp_path, rng):
         "The calibration found beside them: slam_left, slam_right.",
         "1 of 4 images were left out, as their camera is not known; the first is else.png with 400 x 300 pixels.",
     )
+
+
+SENSORS = """# kapture format: 1.1
+# sensor_id, name, sensor_type, [sensor_params]+
+007, , camera, OPENCV_FISHEYE, 400, 300, 90, 90, 200, 150, 0, 0, 0, 0
+010, , camera, OPENCV_FISHEYE, 400, 300, 95, 90, 200, 150, 0, 0, 0, 0
+GPS, gps, gnss, EPSG:4326
+"""
+
+
+def test_folders_have_the_cameras_of_their_numbers(tmp_path, rng):
+    """Of a file with several cameras beside the folders, or of one that is given: only if each folder has one."""
+    for name in ("cam07", "cam10"):
+        (tmp_path / name).mkdir()
+        picture(tmp_path / name / "1.png", 400, 300, rng)
+    (tmp_path / "sensors.txt").write_text(SENSORS)
+    found = photographs(tmp_path, {})
+    assert [(view.name, view.camera.fx) for view in found.views] == [("cam07/1.png", 90.0), ("cam10/1.png", 95.0)]
+    assert found.remarks == (
+        "cam07: The calibration found beside them: 007.",
+        "cam10: The calibration found beside them: 010.",
+    )
+    given = cameras_of_file(tmp_path / "sensors.txt", None)
+    assert [view.camera.fx for view in photographs(tmp_path, given).views] == [90.0, 95.0]
+    (tmp_path / "cam07").rename(tmp_path / "cam09")
+    found = photographs(tmp_path, {})
+    assert {view.camera.fx for view in found.views} == {90.0}
+    assert "cam09: Camera 007 is taken for all images of 400 x 300 pixels, but 010 would fit" in found.remarks[0]
 
 
 @pytest.fixture(scope="module")
