@@ -28,8 +28,10 @@ from spherloc.mapping.written import Kept, Written, cameras_of, write_map
 
 GROUP = "group"
 """Name of the folder, with a number, of a map of images that could not be joined with the rest."""
-MIN_OF_GROUP = 3
+MIN_OF_GROUP = 2
 """Least number of images of such a map."""
+MIN_POINTS_OF_TWO = 200
+"""Least number of points of such a map of two images, which nothing else confirms."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ def make_map(
             found = _finished(other.without(inside), views, names, gravity, measured, tell)  # others do not grow
         except InputError:  # its images do not agree on where down is
             continue
-        if len(found[0].poses) < MIN_OF_GROUP:
+        if not _worth_a_map(found[0]):
             continue
         inside |= found[0].poses.keys()
         place = folder / f"{GROUP}_{len(groups) + 2}"
@@ -128,6 +130,12 @@ def make_map(
             raise InputError(f"{place}: cannot be made ({error.strerror}); give another --output.") from None
         groups.append(Map(*found, write_map(*found, views, images, place, new_images, kept)))
     return replace(made, groups=tuple(groups))
+
+
+def _worth_a_map(made: Reconstruction) -> bool:
+    """Whether images that could not be joined with the rest are a map of their own."""
+    count = len(made.poses)
+    return count > MIN_OF_GROUP or (count == MIN_OF_GROUP and len(made.model.points3D) >= MIN_POINTS_OF_TWO)
 
 
 def nearer_to_others(made: Reconstruction, others: Sequence[Reconstruction]) -> set[str]:

@@ -185,7 +185,9 @@ def _units_unknown(made: Map) -> str:
 
 def summary(made: Map, found: Photographs) -> list[str]:
     """The result in lines of text."""
-    written, missing = made.written, [view.name for view in found.views if view.name not in made.written.poses]
+    written = made.written
+    placed = {name for one in (made, *made.groups) for name in one.written.poses}
+    missing = [view.name for view in found.views if view.name not in placed]
     lines = [
         f"in the map    {len(written.poses)} of {len(found.views)} images, {len(written.points):,} points, "
         f"{written.error_px:.2f} px mean error",

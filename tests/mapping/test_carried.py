@@ -1,13 +1,19 @@
 """What moves with the camera below panoramas is found where there is something, and nothing where there is not."""
 
+import shutil
+
 import cv2
 import pytest
 
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.frontend.masks import around
 from spherloc.mapping.carried import BELOW_DEG, carried_nadir_deg
+from spherloc.mapping.make import ScaleMeasurement, make_map
+from spherloc.mapping.photographs import photographs
+from spherloc_viz.commands.map import summary
 from tests.frontend.pictures import texture
 from tests.frontend.textured_rooms import FISHEYE, room_view, standing, wallpaper
+from tests.needs import real_data
 
 CAMERA = Equirectangular(640, 320)
 PLACES = ((-1.5, -2.0, 0.0), (-0.5, -1.0, 0.3), (0.5, 0.5, 1.0), (1.5, 2.0, 2.5))
@@ -61,3 +67,18 @@ def test_the_ground_is_none(tmp_path, rng):
 def test_images_that_are_no_panoramas_are_not_searched(tmp_path, rng):
     views = rooms(tmp_path, FISHEYE)
     assert carried_nadir_deg(views, lambda *what: pytest.fail("an image was searched")) == 0.0
+
+
+def test_real_places_with_one_tripod_are_maps_of_their_own(tmp_path):
+    """Three rooms with two panoramas each; all pictures show the tripod, two of the rooms the same one."""
+    folder = real_data("pano_vertical_pairs")
+    for path in folder.glob("*.png"):
+        shutil.copy(path, tmp_path)
+    found = photographs(tmp_path, {})
+    made = make_map(found.views, tmp_path, tmp_path / "map", ScaleMeasurement(), None, lambda *_: None)
+    assert 24.0 <= made.carried_deg <= 36.0
+    rooms = [{name.partition("_")[0] for name in one.written.poses} for one in (made, *made.groups)]
+    assert sorted(map(sorted, rooms)) == [["hall"], ["room"], ["stairs"]]
+    lines = "\n".join(summary(made, found))
+    assert lines.count("on its own") == 2 and "left out" not in lines and "around straight down" in lines
+    assert "nadir_deg = " in (tmp_path / "map" / "group_2" / "scene.toml").read_text()
