@@ -16,6 +16,7 @@ from spherloc.frontend.features import Features, extract
 from spherloc.frontend.masks import around
 from spherloc.frontend.matching import match
 from spherloc.frontend.view import View
+from spherloc.mapping.parallel import as_completed
 from spherloc.mapping.upright import Tell
 from spherloc.types import BoolArray, FloatArray
 
@@ -45,17 +46,21 @@ def carried_nadir_deg(views: Sequence[View], tell: Tell) -> float:
     if len(panoramas) < max(MIN_IMAGES, len(views)):
         return 0.0
     spread = np.unique(np.linspace(0, len(panoramas) - 1, MAX_IMAGES).round().astype(int))
-    below = []
-    for done, index in enumerate(spread.tolist(), start=1):
-        view = panoramas[index]
-        features = extract(replace(view, mask=partial(_below, view)))
-        below.append((features, view.camera.unproject(features.pixels)[0]))
-        tell("images searched for what moves with the camera", done, len(spread))
-    pairs = list(combinations(below, 2))
+    below: dict[int, tuple[Features, FloatArray]] = {}
+    for index, found in as_completed(lambda index: _features_below(panoramas[index]), spread.tolist()):
+        below[index] = found
+        tell("images searched for what moves with the camera", len(below), len(spread))
+    pairs = list(combinations([below[index] for index in spread.tolist()], 2))
     edges_deg = [edge for pair in pairs if (edge := _edge_deg(*pair)) is not None]
     if len(edges_deg) < MIN_SHARE * len(pairs):
         return 0.0
     return float(np.ceil(min(np.median(edges_deg) + MARGIN_DEG, BELOW_DEG)))
+
+
+def _features_below(view: View) -> tuple[Features, FloatArray]:
+    """Features below a panorama, and their bearings (N, 3)."""
+    features = extract(replace(view, mask=partial(_below, view)))
+    return features, view.camera.unproject(features.pixels)[0]
 
 
 def _edge_deg(one: tuple[Features, FloatArray], other: tuple[Features, FloatArray]) -> float | None:

@@ -13,10 +13,9 @@ and the map with more images, minus a penalty for contradictions, is taken.
 import copy
 import hashlib
 import json
-import os
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -37,6 +36,7 @@ from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import camera_centre
 from spherloc.mapping.pairs import MIN_MATCHES, ImagePairs, relative
+from spherloc.mapping.parallel import as_completed
 from spherloc.mapping.rotations import agreeing
 from spherloc.mapping.triangles import Pair, open_triangles
 from spherloc.mapping.upright import Tell
@@ -136,10 +136,11 @@ def reconstruct(
     pycolmap = require("pycolmap", "colmap", "making a map")
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # errors are reported here instead
     how = how or FrontendOptions()
-    features = []
-    for view in views:
-        features.append(extract(view, how.features))
-        tell("images searched for features", len(features), len(views))
+    extracted: dict[int, Features] = {}
+    for index, found in as_completed(lambda index: extract(views[index], how.features), range(len(views))):
+        extracted[index] = found
+        tell("images searched for features", len(extracted), len(views))
+    features = [extracted[index] for index in range(len(views))]
     usable = [_usable(view.camera, one.pixels) for view, one in zip(views, features, strict=True)]
     path = folder / f"matches_{_key(views, how)}.db"
     try:
@@ -391,34 +392,33 @@ def _matched(
         if database.exists_two_view_geometry(*_of(ids, pair)):
             found[pair] = database.read_two_view_geometry(*_of(ids, pair))
     done = len(waiting) - len(todo)
-    with ThreadPoolExecutor(_workers()) as pool:
-        for pair, (pairs, geometry) in _as_completed(pool, compared.compare, todo):
-            if geometry is not None:
-                found[pair] = geometry
-                database.write_two_view_geometry(*_of(ids, pair), geometry)
-            database.write_matches(*_of(ids, pair), pairs)  # last, since it marks the pair as done
-            done += 1
-            tell("pairs of images matched", done, len(waiting))
-        same_place = {pair: found.pop(pair) for pair in sorted(found) if compared.same_place(found[pair])}
-        found = _agreeing(found)
-        known = {pair: relative(geometry) for pair, geometry in found.items()}
-        between = {pair: middles for pair, middles in open_triangles(known).items() if pair not in same_place}
+    for pair, (pairs, geometry) in as_completed(lambda pair: compared.compare(*pair), todo):
+        if geometry is not None:
+            found[pair] = geometry
+            database.write_two_view_geometry(*_of(ids, pair), geometry)
+        database.write_matches(*_of(ids, pair), pairs)  # last, since it marks the pair as done
+        done += 1
+        tell("pairs of images matched", done, len(waiting))
+    same_place = {pair: found.pop(pair) for pair in sorted(found) if compared.same_place(found[pair])}
+    found = _agreeing(found)
+    known = {pair: relative(geometry) for pair, geometry in found.items()}
+    between = {pair: middles for pair, middles in open_triangles(known).items() if pair not in same_place}
 
-        def close(first: int, second: int) -> Any:
-            return compared.between((first, second), matches[first, second], known, between[first, second])
+    def close(pair: Pair) -> Any:
+        return compared.between(pair, matches[pair], known, between[pair])
 
-        matches = {
-            pair: database.read_matches(*_of(ids, pair))
-            for pair in sorted(between)
-            if database.exists_matches(*_of(ids, pair))
-        }
-        for done, (pair, geometry) in enumerate(_as_completed(pool, close, list(matches)), start=1):
-            tell("pairs with an image between them matched", done, len(matches))
-            if geometry is not None:
-                found[pair] = geometry
-                if database.exists_two_view_geometry(*_of(ids, pair)):
-                    database.delete_two_view_geometry(*_of(ids, pair))
-                database.write_two_view_geometry(*_of(ids, pair), geometry)
+    matches = {
+        pair: database.read_matches(*_of(ids, pair))
+        for pair in sorted(between)
+        if database.exists_matches(*_of(ids, pair))
+    }
+    for done, (pair, geometry) in enumerate(as_completed(close, list(matches)), start=1):
+        tell("pairs with an image between them matched", done, len(matches))
+        if geometry is not None:
+            found[pair] = geometry
+            if database.exists_two_view_geometry(*_of(ids, pair)):
+                database.delete_two_view_geometry(*_of(ids, pair))
+            database.write_two_view_geometry(*_of(ids, pair), geometry)
     return _counts(_agreeing(found), len(ids)), _counts(same_place, len(ids))
 
 
@@ -435,25 +435,6 @@ def _counts(found: Mapping[Pair, Any], size: int) -> NDArray[np.int64]:
     for pair, geometry in found.items():
         counts[pair] = counts[pair[::-1]] = len(geometry.inlier_matches)
     return counts
-
-
-def _as_completed(
-    pool: ThreadPoolExecutor, work: Callable[[int, int], Any], pairs: Sequence[tuple[int, int]]
-) -> Iterator[tuple[tuple[int, int], Any]]:
-    """Results as they are completed; only a few are started ahead, so that Ctrl-C need not wait for all."""
-    running: dict[Future[Any], tuple[int, int]] = {}
-    left = iter(pairs)
-    while True:
-        while len(running) < 2 * _workers() and (pair := next(left, None)) is not None:
-            running[pool.submit(work, *pair)] = pair
-        if not running:
-            return
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
-            yield running.pop(future), future.result()
-
-
-def _workers() -> int:
-    return max(1, min(4, os.cpu_count() or 1))
 
 
 def _of(ids: Sequence[int], pair: tuple[int, int]) -> tuple[int, int]:

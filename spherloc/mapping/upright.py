@@ -12,6 +12,7 @@ from spherloc.errors import InputError, show
 from spherloc.frontend.gravity_from_lines import gravity_from_lines
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN, align_to_down, camera_centre
+from spherloc.mapping.parallel import as_completed
 from spherloc.mapping.positions import MAX_SCALE_SD, Positions, overlaid
 from spherloc.types import FloatArray
 
@@ -76,12 +77,18 @@ def gravity_by_lines(views: Sequence[View], tell: Tell) -> dict[str, Gravity]:
 
     ``tell`` is called after each image.
     """
-    found = {}
-    for done, view in enumerate(views, start=1):
+
+    def measure(view: View) -> Gravity | None:
         with suppress(InputError):  # too few lines in this image
-            found[view.name] = gravity_from_lines(view)
+            return gravity_from_lines(view)
+        return None
+
+    found = {}
+    for done, (view, gravity) in enumerate(as_completed(measure, views), start=1):
+        if gravity is not None:
+            found[view.name] = gravity
         tell("images searched for vertical lines", done, len(views))
-    return found
+    return {view.name: found[view.name] for view in views if view.name in found}
 
 
 def level_of(poses: Mapping[str, FloatArray], gravity: Mapping[str, Gravity]) -> Level:
