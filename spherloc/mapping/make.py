@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from spherloc.errors import InputError, show
-from spherloc.files import is_folder
+from spherloc.files import is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
@@ -91,6 +91,8 @@ def make_map(
             f"{new_images}: its images would have one camera, but the photographs have {count}; leave --localize out, "
             "and write a scene of kind image-folder for them (spherloc scenes image-folder)."
         )
+    if new_images is not None and not any(map(is_image, names_in(new_images))):
+        raise InputError(f"{new_images}: has no images; give a folder with images that are to be localized.")
     names = {view.name for view in views}
     for name in () if measured.distance is None else measured.distance[:2]:
         if name not in names:

@@ -13,6 +13,7 @@ import os
 import shlex
 import signal
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -27,6 +28,7 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError, SpherlocError, show
+from spherloc.files import is_image, names_in
 from spherloc.frontend import trained
 from spherloc.frontend.features import FeatureOptions
 from spherloc.frontend.masks import Masks
@@ -34,6 +36,7 @@ from spherloc.frontend.matching import MatchOptions
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
+from spherloc.images import read_size
 from spherloc.mapping.make import Map, ScaleMeasurement, make_map
 from spherloc.mapping.pairs import MIN_MATCHES
 from spherloc.mapping.photographs import Photographs, frames_of, photographs
@@ -45,6 +48,8 @@ from spherloc.types import FloatArray
 from spherloc_viz.commands.progress import progress, say
 
 REPORT = "report.html"
+MAX_SIZES = 4
+"""Largest number of different sizes of new images that are named."""
 MAP_FEATURES = {
     "sift": "SIFT",
     "aliked": "ALIKED, matched by LightGlue",
@@ -95,9 +100,24 @@ def make(
         raise InputError(f"{report}: cannot be written ({error.strerror}); give another --output.") from None
     print("\n".join(summary(made, found)))
     print(f"report        {report}")
+    if new_images is not None:
+        print(f"new images    {_sizes(new_images)}")
     print(f"see it        spherloc play {made.written.scene}")
     print(f"localize      spherloc localize {made.written.new_scene or made.written.scene}")
     return 0 if len(made.written.poses) == len(found.views) else 1
+
+
+def _sizes(folder: Path) -> str:
+    """How many images of which size a folder has, the most frequent first; a damaged one counts apart."""
+    sizes: Counter[str] = Counter()
+    for name in names_in(folder):
+        if is_image(name):
+            try:
+                width, height = read_size(folder / name)
+                sizes[f"of {width} x {height} pixels"] += 1
+            except InputError:
+                sizes["damaged"] += 1
+    return ", ".join(f"{count} {size}" for size, count in sizes.most_common(MAX_SIZES))
 
 
 def end_without_a_trace() -> None:

@@ -23,7 +23,7 @@ from spherloc.mapping.make import ScaleMeasurement, make_map, scale_of
 from spherloc.mapping.photographs import _is_in, frames_of, photographs, two_circles
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
 from spherloc.problem import Problem
-from spherloc_viz.commands.map import _kind, cameras_of_file, main, map_report, summary
+from spherloc_viz.commands.map import _kind, _sizes, cameras_of_file, main, map_report, summary
 
 IMAGES = ("reference_002", "reference_003", "reference_004", "reference_005", "reference_006")
 
@@ -477,3 +477,19 @@ def test_the_height_of_the_cameras_gives_the_scale(rng):
         scale_by_height(poses, points[2000:4000], level, 1.6)
     with pytest.raises(InputError, match="lie at all depths"):
         scale_by_height(poses, points[4500:], level, 1.6)
+
+
+def test_new_images_are_counted_by_their_size(tmp_path, rng):
+    """Before a map is made, a folder without images is refused."""
+    new, empty = tmp_path / "new", tmp_path / "empty"
+    for folder in (new, empty):
+        folder.mkdir()
+    for name, size in (("a.png", (400, 200)), ("b.png", (400, 200)), ("c.png", (300, 200))):
+        picture(new / name, *size, rng)
+    (new / "d.jpg").write_text("no image")
+    (empty / "notes.txt").write_text("nothing")
+    assert _sizes(new) == "2 of 400 x 200 pixels, 1 of 300 x 200 pixels, 1 damaged"
+    views = photographs(new, {}).views
+    with pytest.raises(InputError, match="empty: has no images; give a folder with images that are to be localized"):
+        make_map(views, new, tmp_path / "map", ScaleMeasurement(), empty, lambda *_: None)
+    assert not (tmp_path / "map").exists()
