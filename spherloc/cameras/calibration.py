@@ -10,7 +10,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from spherloc.cameras import ocam_files, tool_files
+from spherloc.cameras import json_files, ocam_files, tool_files
 from spherloc.cameras._checks import located
 from spherloc.cameras._files import KNOWN, UnrecognisedError, parse_json, parse_yaml, read_text, table_of, value_of
 from spherloc.cameras.base import Camera
@@ -37,9 +37,10 @@ def load_camera(path: str | Path, name: str | None = None) -> Camera:
     The kind is recognised by the content: a KITTI-360 YAML (``model_type: MEI``), a Kalibr camchain (``cam0``, ...:
     pinhole or omni with radtan, equidistant or none, ds, eucm), the YAML of stella_vslam (``Camera``), 360Loc
     (``imgw``) and fisheye-calib-adapter (``parameter``), that of OpenCV's samples and of ROS
-    (``distortion_coefficients``), a Basalt JSON (``value0``), COLMAP's ``cameras.txt``, OCamCalib's
-    ``calib_results.txt`` and a TOML with a ``[camera]`` table or with its keys at the top. ``name`` picks one of
-    ``camera_names``, by default the first one. Principal points that count from the centre of the top-left pixel are
+    (``distortion_coefficients``), a Basalt JSON (``value0``), a JSON of cameras by name (``model``, ``params``),
+    nerfstudio's ``transforms.json`` (``fl_x``), COLMAP's ``cameras.txt``, OCamCalib's ``calib_results.txt`` and a TOML
+    with a ``[camera]`` table or with its keys at the top. ``name`` picks one of ``camera_names``, by default the first
+    one. Principal points that count from the centre of the top-left pixel are
     moved by +0.5 pixels to this project's convention (that centre is (0.5, 0.5)). A file of another kind is given to
     the readers of extensions (docs/extending.md).
 
@@ -60,7 +61,8 @@ def camera_names(path: str | Path) -> tuple[str, ...]:
     with located(str(path)):
         text = read_text(Path(path))
         if text.lstrip().startswith("{"):
-            return tool_files.basalt_names(parse_json(text))
+            document = parse_json(text)
+            return tool_files.basalt_names(document) or tuple(json_files.named_cameras(document))
         if _looks_like_yaml(text):
             return tuple(tool_files.chain_tables(parse_yaml(text)))
         return tuple(colmap_lines(text))
@@ -114,7 +116,12 @@ def _looks_like_yaml(text: str) -> bool:
 def _from_json(document: Any, name: str | None) -> Camera:
     if isinstance(document, dict) and "value0" in document:
         return tool_files.basalt(document, name)
-    raise UnrecognisedError(f"this JSON has no 'value0' at its top: {KNOWN}.")
+    if json_files.named_cameras(document):
+        return json_files.camera_named(document, name)
+    if json_files.is_transforms(document):
+        _refuse_name(name)
+        return json_files.transforms(document)
+    raise UnrecognisedError(f"this JSON has neither 'value0', cameras with 'model' and 'params', nor 'fl_x': {KNOWN}.")
 
 
 def _from_yaml(document: Any, name: str | None) -> Camera:

@@ -200,8 +200,16 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     down, assumed = gravity_of_map(gravity, references, where)
     queries = (view for view in views if view.name in chosen)
     remarks = [*remarks, *left_out, *assumed]
-    cloud = model.points.xyz
-    return settings.scene(path, queries, references, down, remarks, assumed_down=bool(assumed), cloud=cloud)
+    return settings.scene(
+        path,
+        queries,
+        references,
+        down,
+        remarks,
+        assumed_down=bool(assumed),
+        cloud=model.points.xyz,
+        truth_source="the model, which the queries' own images helped to make",
+    )
 
 
 def _chosen(value: Any, names: list[str], where: str) -> list[str]:

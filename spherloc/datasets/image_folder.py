@@ -1,8 +1,9 @@
 """Image folder: a user's own panoramas or fisheye images, localized in a COLMAP model or among images with poses."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
@@ -182,7 +183,12 @@ EXAMPLE = """\
 kind = "image-folder"
 name = "my walk"
 images = "queries"              # a folder of query images, or a list of files
+# queries = ["a.jpg", "b.jpg"]  # only these images of the folder; else all
 calibration = "camera.yaml"     # of the queries: any file that spherloc reads; or a section [camera]
+
+# [[cameras]]                   # queries of several cameras
+# images = "left*"              # a pattern of names, or a list of names
+# calibration = "left.yaml"     # or camera = {...}
 
 [map]                           # the references are a COLMAP model ...
 model = "sparse/0"
@@ -213,7 +219,24 @@ bound_deg = 3.0
 GRAVITY_BOUND_DEG = 3.0
 """Default bound on a query's gravity, taken from its most similar reference; 0 where the scene states it."""
 
-_OPTIONAL = {"calibration", "calibration_camera", "camera", "map", "references", "truth"}
+_OPTIONAL = _CAMERA_KEYS | {"cameras", "map", "queries", "references", "truth"}
+
+
+@dataclass(frozen=True)
+class _Cameras:
+    """The cameras of the queries."""
+
+    shared: Camera | None
+    """That of the queries without one of their own."""
+    own: tuple[tuple[str | frozenset[str], Camera], ...]
+    """A pattern of names or a set of names, and the camera of these queries; the first that fits counts."""
+
+    def of(self, name: str) -> Camera | None:
+        """The camera of the query of that name."""
+        for names, camera in self.own:
+            if fnmatchcase(name, names) if isinstance(names, str) else name in names:
+                return camera
+        return self.shared
 
 
 def load(table: dict[str, Any], path: Path) -> MapScene:
@@ -229,18 +252,55 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
         raise InputError(f"{where} [gravity]: has both 'camera' and '{other}'; keep one.")
     bound_deg = 0.0 if "camera" in gravity else GRAVITY_BOUND_DEG
     settings = map_scene.read_settings(table | {"gravity": shared_gravity}, where, bound_deg)
-    camera = read_camera(table, path, where)
-    if camera is None:
-        raise InputError(f"{where}: the query images have no camera; add 'calibration' or a section [camera].")
-    queries, remarks = _queries(table, camera, gravity, path)
-    references, more, cloud = _references(table, camera, settings.frontend, path)
+    cameras = _cameras(table, path)
+    queries, remarks = _queries(table, cameras, gravity, path)
+    references, more, cloud = _references(table, cameras.shared, settings.frontend, path)
     down, assumed = gravity_of_map(gravity, references, where)
-    remarks = [*remarks, *more, *assumed]
+    remarks = [*remarks, *more, *_in_the_map(queries, references), *assumed]
     return settings.scene(path, queries, references, down, remarks, assumed_down=bool(assumed), cloud=cloud)
 
 
+def _cameras(table: dict[str, Any], path: Path) -> _Cameras:
+    """The cameras that the scene gives its queries; raises ``InputError`` if it gives none."""
+    where = str(path)
+    shared, entries = read_camera(table, path, where), table.get("cameras", [])
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError(f"{where}: 'cameras' must be a list of sections [[cameras]].")
+    if shared is None and not entries:
+        raise InputError(f"{where}: the query images have no camera; add 'calibration' or a section [camera].")
+    own = []
+    for number, entry in enumerate(entries, start=1):
+        place = f"{where} [[cameras]] {number}"
+        scene_file.check_keys(entry, {"images"}, _CAMERA_KEYS, place)
+        camera = read_camera(entry, path, place)
+        if camera is None:
+            raise InputError(f"{place}: has no camera; add 'calibration' or 'camera'.")
+        value = entry["images"]
+        own.append((value if isinstance(value, str) else frozenset(_list_of_names(value, "images", place)), camera))
+    return _Cameras(shared, tuple(own))
+
+
+def _list_of_names(value: Any, key: str, where: str) -> list[str]:
+    names = value if isinstance(value, list) else []
+    if not names or not all(isinstance(name, str) and name and "\0" not in name for name in names):
+        raise InputError(f"{where}: {key} is {show(value)}; give a list of file names.")
+    return names
+
+
+def _in_the_map(queries: Sequence[View], references: Sequence[View]) -> list[str]:
+    """A remark on queries that are references, too."""
+    known = {reference.path.resolve() for reference in references}
+    both = [query.name for query in queries if query.path.resolve() in known]
+    if not both:
+        return []
+    return [
+        f"In the map already, and matched with themselves: {some(both, 'query image')}; use other images to see how "
+        "well new ones are localized."
+    ]
+
+
 def _references(
-    table: dict[str, Any], camera: Camera, frontend: Mapping[str, Any], path: Path
+    table: dict[str, Any], camera: Camera | None, frontend: Mapping[str, Any], path: Path
 ) -> tuple[tuple[View, ...], list[str], FloatArray | None]:
     """The references, remarks, and the points of the map's model if it has one."""
     if ("map" in table) == ("references" in table):
@@ -265,7 +325,7 @@ def _references(
 
 
 def _queries(
-    table: dict[str, Any], camera: Camera, gravity: Mapping[str, Any], path: Path
+    table: dict[str, Any], cameras: _Cameras, gravity: Mapping[str, Any], path: Path
 ) -> tuple[tuple[View, ...], list[str]]:
     """Views of the query images that can be read, and a remark on the others."""
     where = str(path)
@@ -276,7 +336,7 @@ def _queries(
         down = Gravity(unit_vector(gravity["camera"], "camera", f"{where} [gravity]"), "the scene file")
     views, reasons = [], {}
     for name in names:
-        reason, its_camera = _camera_of(root / name, camera)
+        reason, its_camera = _camera_of(root / name, cameras.of(name))
         if its_camera is None:
             reasons.setdefault(reason, []).append(name)
         else:
@@ -288,10 +348,12 @@ def _names(table: dict[str, Any], path: Path) -> tuple[Path, list[str]]:
     """The folder of the queries and their names in it."""
     value = table["images"]
     if isinstance(value, list):
-        if not value or not all(isinstance(name, str) and name and "\0" not in name for name in value):
-            raise InputError(f"{path}: images is {show(value)}; give a folder or a list of files.")
-        return path.parent, value
+        if "queries" in table:
+            raise InputError(f"{path}: 'images' lists files, so 'queries' must be left out.")
+        return path.parent, _list_of_names(value, "images", str(path))
     root = map_scene.folder(table, "images", path)
+    if "queries" in table:
+        return root, _list_of_names(table["queries"], "queries", str(path))
     names = [name for name in names_in(root) if is_image(name)]
     if not names:
         raise InputError(f"{path}: the folder {root} has no images ({', '.join(sorted(IMAGES))}); correct 'images'.")
@@ -306,11 +368,13 @@ def _truth(table: dict[str, Any], names: list[str], where: str) -> dict[str, Flo
     return {name: read_pose(value, show(name), f"{where} [truth]") for name, value in truth.items()}
 
 
-def _camera_of(path: Path, camera: Camera) -> tuple[str, Camera | None]:
+def _camera_of(path: Path, camera: Camera | None) -> tuple[str, Camera | None]:
     """The camera of a query image, judged by its header alone; or why it cannot be a query, and None. Panoramas are
     of any size."""
     if not is_file(path):
         return "no such file", None
+    if camera is None:
+        return "no section [[cameras]] has its name", None
     try:
         width, height = read_size(path)
     except InputError:

@@ -74,6 +74,8 @@ class MapScene:
     """A binary glTF of the map in the map frame, metres, for the canvas."""
     cloud: FloatArray | None = None
     """Points (P, 3) of a map without a mesh, map frame, metres, for the canvas."""
+    truth_source: str = ""
+    """What the true poses come from, if it knew more than a query's image is to tell; empty for a measurement."""
     remarks: tuple[str, ...] = ()
     """What the loader skipped and why, in sentences."""
 

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from spherloc.errors import InputError, show
-from spherloc.files import is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.carried import carried_nadir_deg
 from spherloc.mapping.later import place_rest
+from spherloc.mapping.photographs import NewImages
 from spherloc.mapping.positions import Positions, gps_of_images
 from spherloc.mapping.reconstruction import Reconstruction, reconstruct
 from spherloc.mapping.upright import (
@@ -24,7 +24,7 @@ from spherloc.mapping.upright import (
     scale_by_height,
     scale_by_positions,
 )
-from spherloc.mapping.written import Kept, Written, cameras_of, write_map
+from spherloc.mapping.written import Kept, Written, write_map
 
 GROUP = "group"
 """Name of the folder, with a number, of a map of images that could not be joined with the rest."""
@@ -68,7 +68,7 @@ def make_map(
     images: Path,
     folder: Path,
     measured: ScaleMeasurement,
-    new_images: Path | None,
+    new_images: NewImages | None,
     tell: Tell,
     masks: Masks | None = None,
     how: FrontendOptions | None = None,
@@ -77,22 +77,11 @@ def make_map(
 ) -> Map:
     """Make a map of images of one camera or several and write it into ``folder``.
 
-    ``new_images`` is a folder of other images of the one camera, for which a scene is written too; ``masks`` are the
-    masks of the views, which are written into the scenes, and ``how`` says which features are matched. With
-    ``find_carried``, what moves with the camera below panoramas is found and left out, too. Raises
-    ``InputError`` if the images give no map, if ``measured`` names other images, if there are new images of several
-    cameras, or if a file cannot be read or written.
+    For ``new_images``, a scene is written too; ``masks`` are the masks of the views, which are written into the scenes,
+    and ``how`` says which features are matched. With ``find_carried``, what moves with the camera below panoramas is
+    found and left out, too. Raises ``InputError`` if the images give no map, if ``measured`` names other images, or if
+    a file cannot be read or written.
     """
-    if new_images is not None and not is_folder(new_images):
-        raise InputError(f"{new_images}: is not a folder; give one with images that are to be localized.")
-    count = len(cameras_of(views))
-    if new_images is not None and count > 1:
-        raise InputError(
-            f"{new_images}: its images would have one camera, but the photographs have {count}; leave --localize out, "
-            "and write a scene of kind image-folder for them (spherloc scenes image-folder)."
-        )
-    if new_images is not None and not any(map(is_image, names_in(new_images))):
-        raise InputError(f"{new_images}: has no images; give a folder with images that are to be localized.")
     names = {view.name for view in views}
     for name in () if measured.distance is None else measured.distance[:2]:
         if name not in names:

@@ -41,47 +41,32 @@ SHARPNESS_PX = 512
 
 @dataclass(frozen=True)
 class Photographs:
-    """The images that can be mapped, in the order of names, and remarks on the others."""
+    """Images with their cameras, in the order of names, and remarks on the others."""
 
     views: tuple[View, ...]
     remarks: tuple[str, ...]
+    cameras: Mapping[str, Camera]
+    """The calibrations that were given or found, by name or by the folder of their images."""
+
+
+@dataclass(frozen=True)
+class NewImages:
+    """Images that are to be localized in a map."""
+
+    folder: Path
+    views: tuple[View, ...] | None
+    """With their cameras, named by the path in the folder; None for all images there, of the map's one camera."""
 
 
 def photographs(
     folder: Path, cameras: Mapping[str, Camera], masks: Masks | None = None, panorama: bool = False
 ) -> Photographs:
-    """The images of a folder or, if it has none, of the folders in it, with their cameras.
+    """The images from which a map can be made: ``with_cameras``, without the pixels that ``masks`` leave out.
 
-    ``cameras`` are those of a calibration file, by name; without them, calibrations beside the images are taken, and
-    for a folder in ``folder`` also one beside it that has its name, or a file there with several cameras. A single
-    camera is that of all images. Of several with the size of an image it is the one whose name is in the image's name,
-    or that of its folder; a camera that has only a number is that of the folder with this number. Images of 2 to 1
-    count as panoramas where no camera has their size, and if ``panorama`` in any case. Pixels that ``masks`` leave out
-    give no features.
-
-    Raises ``InputError`` if there are fewer than two images with a camera or too many, if no image has a mask, or if
-    a camera has no model in COLMAP.
+    Raises ``InputError`` as that does, and if there are fewer than two images or too many, or if no image has a mask.
     """
-    if not is_folder(folder):
-        raise InputError(what_it_is(folder) or f"{folder}: is not a folder; give the folder of the photographs.")
-    there = names_in(folder)
-    inside = images_in_folders(folder, [name for name in there if not is_image(name)])
-    views: list[View] = []
-    remarks: list[str] = []
-    if any(is_image(name) for name in there) or not inside:
-        views, remarks = _of_folder(folder, "", cameras, {}, panorama)
-        remarks += _about_subfolders(inside)
-    else:
-        folders = sorted(inside)
-        shared = _of_files([folder / name for name in there], least=2)
-        for name in folders:
-            try:
-                given, beside = (_belonging(some, name, folders) for some in (cameras, shared))
-                found, about = _of_folder(folder, name, given, beside, panorama)
-            except InputError as error:
-                found, about = [], [f"It is left out: {error}"]
-            views += found
-            remarks += [f"{shorten(name)}: {remark}" for remark in about]
+    found = with_cameras(folder, cameras, panorama)
+    views, remarks = found.views, found.remarks
     if len(views) < MIN_IMAGES:
         raise InputError(
             f"{folder}: has {_counted(len(views), 'photograph')} with a known camera; a map needs {MIN_IMAGES} or "
@@ -92,10 +77,71 @@ def photographs(
             f"{folder}: has {len(views)} photographs, more than {MAX_IMAGES}; take every n-th of them, or map "
             'them with COLMAP and open its model as kind = "colmap".'
         )
-    if masks is not None:
-        masked, without = masks.on(views)
-        views, remarks = list(masked), [*remarks, *without]
-    return Photographs(tuple(views), tuple(remarks))
+    if masks is None:
+        return found
+    masked, without = masks.on(views)
+    return Photographs(tuple(masked), (*remarks, *without), found.cameras)
+
+
+def with_cameras(folder: Path, cameras: Mapping[str, Camera], panorama: bool = False) -> Photographs:
+    """The images of a folder or, if it has none, of the folders in it, with their cameras.
+
+    ``cameras`` are those of a calibration file, by name; without them, calibrations beside the images are taken, and
+    for a folder in ``folder`` also one beside it that has its name, or a file there with several cameras. A single
+    camera is that of all images. Of several with the size of an image it is the one whose name is in the image's name,
+    or that of its folder; a camera that has only a number is that of the folder with this number. Images of 2 to 1
+    count as panoramas where no camera has their size, and if ``panorama`` in any case.
+
+    Raises ``InputError`` if the folder has no photographs, if their camera is unknown, or if it has no model in COLMAP.
+    """
+    if not is_folder(folder):
+        raise InputError(what_it_is(folder) or f"{folder}: is not a folder; give the folder of the photographs.")
+    there = names_in(folder)
+    inside = images_in_folders(folder, [name for name in there if not is_image(name)])
+    views: list[View] = []
+    remarks: list[str] = []
+    known = dict(cameras)
+    if any(is_image(name) for name in there) or not inside:
+        known = known or _beside(folder, "")
+        views, remarks = _of_folder(folder, "", cameras, known, panorama)
+        remarks += _about_subfolders(inside)
+    else:
+        folders = sorted(inside)
+        shared = _of_files([folder / name for name in there], least=2)
+        for name in folders:
+            try:
+                given, common = (_belonging(some, name, folders) for some in (cameras, shared))
+                found, about = _of_folder(folder, name, given, _beside(folder, name) or common, panorama)
+            except InputError as error:
+                found, about = [], [f"It is left out: {error}"]
+            views += found
+            if len(cameras_of(found)) == 1:
+                known[name] = found[0].camera
+            remarks += [f"{shorten(name)}: {remark}" for remark in about]
+    return Photographs(tuple(views), tuple(remarks), known)
+
+
+def cameras_of(views: Sequence[View]) -> dict[str, Camera]:
+    """The different cameras of the views, by how they are described."""
+    return {repr(view.camera): view.camera for view in views}
+
+
+def new_images_of(folder: Path, mapped: Photographs, panorama: bool = False) -> tuple[NewImages, tuple[str, ...]]:
+    """The images of a folder that are to be localized in the map of others, and remarks on those that cannot be.
+
+    Where the map has several cameras, each image has one of these, as ``with_cameras`` tells. Raises ``InputError`` if
+    there is no image, or none of a camera of the map.
+    """
+    if not is_folder(folder):
+        raise InputError(f"{folder}: is not a folder; give one with images that are to be localized.")
+    if len(cameras_of(mapped.views)) > 1:
+        found = with_cameras(folder, mapped.cameras, panorama)
+        if not found.views:
+            raise InputError(f"{folder}: no image is of a camera of the map. {' '.join(found.remarks)}")
+        return NewImages(folder, found.views), found.remarks
+    if not any(map(is_image, names_in(folder))):
+        raise InputError(f"{folder}: has no images; give a folder with images that are to be localized.")
+    return NewImages(folder, None), ()
 
 
 def _belonging(cameras: Mapping[str, Camera], folder: str, folders: Sequence[str]) -> Mapping[str, Camera]:
@@ -111,12 +157,12 @@ def _belonging(cameras: Mapping[str, Camera], folder: str, folders: Sequence[str
 
 
 def _of_folder(
-    root: Path, inside: str, given: Mapping[str, Camera], shared: Mapping[str, Camera], panorama: bool
+    root: Path, inside: str, given: Mapping[str, Camera], beside: Mapping[str, Camera], panorama: bool
 ) -> tuple[list[View], list[str]]:
     """The images of the folder ``inside`` of ``root``, or of ``root`` itself if that is empty, and remarks on others.
 
-    ``given`` are the cameras that the user gave, ``shared`` those of files for all folders. Raises ``InputError`` if it
-    has none, or if their camera is unknown or has no model in COLMAP.
+    ``given`` are the cameras that the user gave, ``beside`` those of files beside the images. Raises ``InputError`` if
+    it has no images, or if their camera is unknown or has no model in COLMAP.
     """
     folder = root / inside
     sizes: dict[tuple[int, int], list[str]] = {}
@@ -132,7 +178,7 @@ def _of_folder(
     remarks = [*_about_damaged(damaged), *_about_unread(others)]
     if not sizes:
         raise InputError(_without_photographs(folder, remarks))
-    cameras = given if given or panorama else _beside(root, inside) or shared
+    cameras = given if given or panorama else beside
     camera_of: dict[str, Camera] = {}
     for size, names in sizes.items():
         found, about = _with_cameras(names, size, cameras)

@@ -14,6 +14,7 @@ from spherloc.errors import InputError
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
+from spherloc.mapping.photographs import NewImages, cameras_of
 from spherloc.mapping.reconstruction import Reconstruction
 from spherloc.mapping.upright import Level, MapScale, upright_frame
 from spherloc.registry import require
@@ -26,8 +27,7 @@ MIN_BOUND_DEG = 3.0
 EVERY = 4
 """Every fourth image of the map is a query of the scene file, localized against the others."""
 MIN_WITHOUT = 4
-"""Least number of a map's images for which queries are left out of the map; in a smaller one of one camera all points
-are used."""
+"""Least number of a map's images for which queries are left out of the map; in a smaller one all points are used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Written:
     scene: Path
     """Scene file whose queries are images of the map."""
     new_scene: Path | None
-    """Scene file of other images of the same camera; None if there are none."""
+    """Scene file of other images; None if there are none."""
     poses: dict[str, FloatArray]
     """Poses ``cam_from_map`` (3, 4) by the name of the image; the map's z axis points up."""
     points: FloatArray
@@ -62,13 +62,13 @@ def write_map(
     views: Sequence[View],
     images: Path,
     folder: Path,
-    new_images: Path | None,
+    new_images: NewImages | None,
     kept: Kept,
 ) -> Written:
     """Level and scale a model and write it with its scenes into ``folder``.
 
-    ``images`` is the folder of the views, ``new_images`` one of images to be localized, and ``kept`` the settings for
-    the scene files of both. Raises ``InputError`` if a file cannot be written.
+    ``images`` is the folder of the views, and ``kept`` the settings for the scene files. Raises ``InputError`` if a
+    file cannot be written.
     """
     pycolmap = require("pycolmap", "colmap", "making a map")
     turn = pycolmap.Rotation3d(upright_frame(level))
@@ -83,24 +83,20 @@ def write_map(
         (folder / MODEL).mkdir(parents=True, exist_ok=True)
         made.model.write(str(folder / MODEL))
         scene = folder / SCENE
-        if len(names) >= MIN_WITHOUT or len(cameras_of(views)) > 1:
+        if len(names) >= MIN_WITHOUT:
             content = _scene(folder, images, names, about, level, scale)
         else:
-            content = _new_scene(folder, images, images, views[0], about, level, scale)
+            own = NewImages(images, tuple(view for view in views if view.name in poses))
+            content = _new_scene(folder, images, own, views[0].camera, about, level, scale)
         scene.write_text(content + _kept(kept, folder), encoding="utf-8")
         new_scene = None
         if new_images is not None:
             new_scene = folder / NEW_SCENE
-            content = _new_scene(folder, images, new_images, views[0], about, level, scale)
+            content = _new_scene(folder, images, new_images, views[0].camera, about, level, scale)
             new_scene.write_text(content + _kept(kept, folder), encoding="utf-8")
     except (OSError, RuntimeError) as error:
         raise InputError(f"{folder}: cannot be written ({error}); give another --output.") from None
     return Written(scene, new_scene, poses, made.points(), float(made.model.compute_mean_reprojection_error()))
-
-
-def cameras_of(views: Sequence[View]) -> dict[str, Camera]:
-    """The different cameras of the views, by how they are described."""
-    return {repr(view.camera): view.camera for view in views}
 
 
 def _about(made: Reconstruction, level: Level, scale: MapScale, count: int) -> str:
@@ -121,24 +117,22 @@ def _scene(folder: Path, images: Path, names: Sequence[str], about: str, level: 
         f"images = {_text(_relative(images, folder))}",
         *_units(scale),
         "# Localized against the other images; those of the map that you name here are left out of it.",
-        f"queries = {json.dumps(queries, ensure_ascii=False)}",
+        f"queries = {_names(queries)}",
         *_gravity(level),
     ]
     return "\n".join(lines) + "\n"
 
 
 def _new_scene(
-    folder: Path, images: Path, new_images: Path, view: View, about: str, level: Level, scale: MapScale
+    folder: Path, images: Path, new_images: NewImages, camera: Camera, about: str, level: Level, scale: MapScale
 ) -> str:
     lines = [
         'kind = "image-folder"',
-        f"name = {_text(f'{new_images.name} in {_name(images, scale)}')}",
+        f"name = {_text(f'{new_images.folder.resolve().name} in {_name(images, scale)}')}",
         f"about = {_text(about)}",
-        f"images = {_text(_relative(new_images, folder))}",
+        f"images = {_text(_relative(new_images.folder, folder))}",
         *_units(scale),
-        "",
-        "[camera]",
-        *(f"{key} = {_value(value)}" for key, value in view.camera.to_dict().items()),
+        *_queries(new_images.views or (), camera),
         "",
         "[map]",
         f"model = {_text(MODEL)}",
@@ -146,6 +140,30 @@ def _new_scene(
         *_gravity(level),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _queries(views: Sequence[View], camera: Camera) -> list[str]:
+    """The queries and their cameras; without views, all images of the folder are queries of the one camera."""
+    if not views:
+        return ["", "[camera]", *_camera(camera)]
+    lines = [f"queries = {_names([view.name for view in views])}"]
+    names: dict[str, list[str]] = {}
+    for view in views:
+        names.setdefault(repr(view.camera), []).append(view.name)
+    cameras = cameras_of(views)
+    if len(cameras) == 1:
+        return [*lines, "", "[camera]", *_camera(views[0].camera)]
+    for key, own in names.items():
+        lines += ["", "[[cameras]]", f"images = {_names(own)}", "[cameras.camera]", *_camera(cameras[key])]
+    return lines
+
+
+def _names(names: Sequence[str]) -> str:
+    return json.dumps(names, ensure_ascii=False)
+
+
+def _camera(camera: Camera) -> list[str]:
+    return [f"{key} = {_value(value)}" for key, value in camera.to_dict().items()]
 
 
 def _name(images: Path, scale: MapScale) -> str:

@@ -39,10 +39,9 @@ from spherloc.geometry import camera_centre
 from spherloc.images import read_size
 from spherloc.mapping.make import Map, ScaleMeasurement, make_map
 from spherloc.mapping.pairs import MIN_MATCHES
-from spherloc.mapping.photographs import Photographs, frames_of, photographs
+from spherloc.mapping.photographs import NewImages, Photographs, cameras_of, frames_of, new_images_of, photographs
 from spherloc.mapping.positions import read_positions
 from spherloc.mapping.upright import Tell
-from spherloc.mapping.written import cameras_of
 from spherloc.registry import require
 from spherloc.types import FloatArray
 from spherloc_viz.commands.progress import progress, say
@@ -91,8 +90,13 @@ def make(
             measured = ScaleMeasurement(positions=read_positions(positions, found.views))
         for remark in found.remarks:
             say(remark)
+        others = None
+        if new_images is not None:
+            others, remarks = new_images_of(new_images, found, panorama)
+            for remark in remarks:
+                say(f"{new_images}: {remark}")
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
-        made = make_map(found.views, folder, target, measured, new_images, tell, masks, how, find_carried=find_carried)
+        made = make_map(found.views, folder, target, measured, others, tell, masks, how, find_carried=find_carried)
     report = target / REPORT
     try:
         report.write_text(map_report(made, found), encoding="utf-8")
@@ -100,23 +104,23 @@ def make(
         raise InputError(f"{report}: cannot be written ({error.strerror}); give another --output.") from None
     print("\n".join(summary(made, found)))
     print(f"report        {report}")
-    if new_images is not None:
-        print(f"new images    {_sizes(new_images)}")
+    if others is not None:
+        print(f"new images    {_sizes(others)}")
     print(f"see it        spherloc play {made.written.scene}")
     print(f"localize      spherloc localize {made.written.new_scene or made.written.scene}")
     return 0 if len(made.written.poses) == len(found.views) else 1
 
 
-def _sizes(folder: Path) -> str:
-    """How many images of which size a folder has, the most frequent first; a damaged one counts apart."""
+def _sizes(images: NewImages) -> str:
+    """How many new images of which size there are, the most frequent first; a damaged one counts apart."""
     sizes: Counter[str] = Counter()
-    for name in names_in(folder):
-        if is_image(name):
-            try:
-                width, height = read_size(folder / name)
-                sizes[f"of {width} x {height} pixels"] += 1
-            except InputError:
-                sizes["damaged"] += 1
+    known = None if images.views is None else [view.name for view in images.views]
+    for name in filter(is_image, names_in(images.folder)) if known is None else known:
+        try:
+            width, height = read_size(images.folder / name)
+            sizes[f"of {width} x {height} pixels"] += 1
+        except InputError:
+            sizes["damaged"] += 1
     return ", ".join(f"{count} {size}" for size, count in sizes.most_common(MAX_SIZES))
 
 

@@ -38,6 +38,7 @@ depth_unit_m = 0.001
 along = "ray"
 """
 POSED = f"{REFERENCE}cam_from_map = {POSE}\n"
+CAMERA_OF = 'camera = {model = "equirectangular", width = 64, height = 32}\n'
 DEPTH_MM = 1500
 
 
@@ -70,6 +71,30 @@ def test_a_list_of_queries_and_their_own_gravity(tmp_path):
     np.testing.assert_array_equal(scene.queries[0].gravity.down, [0, 1, 0])
     np.testing.assert_array_equal(scene.gravity_map, [0, 0, -1])
     assert scene.gravity_bound_rad == 0.0 and scene.remarks == ()
+
+
+def test_queries_of_several_cameras_and_only_some_of_a_folder(tmp_path):
+    """A pattern or names give a query its camera; one that neither fits is left out, and one of the map is told."""
+    small = '[[cameras]]\nimages = {}\ncamera = {{model = "equirectangular", width = {}, height = {}}}\n'
+    path = make_tree(tmp_path, small.format('"b*"', 64, 32) + POSED.replace("cam_from_map", CAMERA_OF + "cam_from_map"))
+    scene = load_scene(path)
+    assert [view.name for view in scene.queries] == ["b.png"]
+    assert "1 query image (a.jpg) left out: no section [[cameras]] has its name." in scene.remarks
+    own = small.format('["a.jpg"]', 32, 16) + CAMERA + POSED
+    cv2.imwrite(str(tmp_path / "queries" / "a.jpg"), np.full((16, 32, 3), 90, np.uint8))
+    both = load_scene(make_tree(tmp_path, own, head='images = "."\nqueries = ["queries/b.png", "reference.png"]'))
+    assert [view.name for view in both.queries] == ["queries/b.png", "reference.png"]
+    assert any("matched with themselves: 1 query image (reference.png)" in remark for remark in both.remarks)
+    assert {view.camera.width for view in both.queries} == {64}
+    for wrong, said in (
+        (small.format("3", 64, 32), r"\[\[cameras\]\] 1: images is 3; give a list of file names"),
+        ('[[cameras]]\nimages = "a*"\n', r"\[\[cameras\]\] 1: has no camera"),
+        ("[cameras]\n", "'cameras' must be a list of sections"),
+    ):
+        with pytest.raises(InputError, match=said):
+            load_scene(make_tree(tmp_path, wrong + CAMERA + POSED))
+    with pytest.raises(InputError, match="'images' lists files, so 'queries' must be left out"):
+        load_scene(make_tree(tmp_path, CAMERA + POSED, head='images = ["queries/b.png"]\nqueries = ["a.jpg"]'))
 
 
 def test_queries_that_cannot_be_read_are_left_out_and_counted(tmp_path):

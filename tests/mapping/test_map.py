@@ -20,8 +20,17 @@ from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.make import ScaleMeasurement, make_map, scale_of
-from spherloc.mapping.photographs import _is_in, frames_of, photographs, two_circles
+from spherloc.mapping.photographs import (
+    NewImages,
+    Photographs,
+    _is_in,
+    frames_of,
+    new_images_of,
+    photographs,
+    two_circles,
+)
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
+from spherloc.mapping.written import _camera, _queries
 from spherloc.problem import Problem
 from spherloc_viz.commands.map import _kind, _sizes, cameras_of_file, main, map_report, summary
 
@@ -48,7 +57,8 @@ def walk(tmp_path_factory):
     measured = ScaleMeasurement(distance=(first, second, apart))
 
     def again():
-        return make_map(found.views, folder, output, measured, folder, lambda *what: told.append(what), masks)
+        new = NewImages(folder, None)
+        return make_map(found.views, folder, output, measured, new, lambda *what: told.append(what), masks)
 
     return poses, found, again(), again, told, output
 
@@ -178,8 +188,6 @@ def test_each_image_of_a_rig_has_its_camera(tmp_path, rng):
         by_name.remarks
     )
     assert {view.camera.fx for view in photographs(tmp_path, {"": other}).views} == {95.0}
-    with pytest.raises(InputError, match="the photographs have 2; leave --localize out"):
-        make_map(found.views, tmp_path, tmp_path / "map", ScaleMeasurement(), tmp_path, print)
 
     flat = tmp_path / "flat"
     flat.mkdir()
@@ -488,8 +496,46 @@ def test_new_images_are_counted_by_their_size(tmp_path, rng):
         picture(new / name, *size, rng)
     (new / "d.jpg").write_text("no image")
     (empty / "notes.txt").write_text("nothing")
-    assert _sizes(new) == "2 of 400 x 200 pixels, 1 of 300 x 200 pixels, 1 damaged"
-    views = photographs(new, {}).views
+    assert _sizes(NewImages(new, None)) == "2 of 400 x 200 pixels, 1 of 300 x 200 pixels, 1 damaged"
+    mapped = Photographs(tuple(view for view in photographs(new, {}).views if view.camera.width == 400), (), {})
+    assert new_images_of(new, mapped) == (NewImages(new, None), ())
     with pytest.raises(InputError, match="empty: has no images; give a folder with images that are to be localized"):
-        make_map(views, new, tmp_path / "map", ScaleMeasurement(), empty, lambda *_: None)
-    assert not (tmp_path / "map").exists()
+        new_images_of(empty, mapped)
+
+
+def test_new_images_of_several_cameras(tmp_path, rng):
+    """Each has the camera whose name is in its own, or that of its folder's name; their scene is read as it was
+    written."""
+    left, right = (KannalaBrandt(400, 300, focal, focal, 200.0, 150.0, (0.0,) * 4) for focal in (90.0, 95.0))
+    mapped, flat, folders = (tmp_path / name for name in ("mapped", "flat", "folders"))
+    for folder in (mapped, flat, folders / "left", folders / "right"):
+        folder.mkdir(parents=True)
+    for name in ("left_1.png", "right_1.png"):
+        picture(mapped / name, 400, 300, rng)
+    for place in (flat / "left_8.png", flat / "right_9.png", folders / "left" / "7.png", folders / "right" / "7.png"):
+        picture(place, 400, 300, rng)
+    picture(flat / "right_small.png", 200, 150, rng)
+    known = photographs(mapped, {"left": left, "right": right})
+    found, remarks = new_images_of(flat, known)
+    assert found.views is not None and [view.camera.fx for view in found.views] == [90.0, 95.0]
+    assert len(remarks) == 1 and "right_small.png" in remarks[0]
+    inside, _ = new_images_of(folders, known)
+    assert inside.views is not None
+    assert [(view.name, view.camera.fx) for view in inside.views] == [("left/7.png", 90.0), ("right/7.png", 95.0)]
+    (tmp_path / "small").mkdir()
+    picture(tmp_path / "small" / "left.png", 200, 150, rng)
+    with pytest.raises(InputError, match="no image is of a camera of the map"):
+        new_images_of(tmp_path / "small", known)
+
+    pose = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, {}]]"
+    references = "".join(
+        f'[[references]]\nimage = "mapped/{name}_1.png"\ncam_from_map = {pose.format(at)}\n'
+        f"[references.camera]\n{chr(10).join(_camera(camera))}\n"
+        for at, (name, camera) in enumerate({"left": left, "right": right}.items())
+    )
+    for folder, views in (("flat", found.views), ("folders", inside.views)):
+        lines = ['kind = "image-folder"', 'name = "new"', f'images = "{folder}"', *_queries(views, left)]
+        (tmp_path / "scene.toml").write_text("\n".join([*lines, references]))
+        scene = load_scene(tmp_path / "scene.toml")
+        assert [(view.name, view.camera) for view in scene.queries] == [(view.name, view.camera) for view in views]
+        assert not any("left out" in remark for remark in scene.remarks)
