@@ -1,8 +1,9 @@
 """Judges a run without the truth: localized, doubtful or failed, by one rule.
 
 A pose is believed if its inliers are more than chance explains, if no clearly different pose is supported about as well
-and no pose with another gravity much better, and if they fix it to within the errors of a success. Each condition has a
-margin, which is 0 at its limit; the smallest margin is the run's score.
+and no pose with another gravity much better, if they fix it to within the errors of a success, and if they do not lie
+on one thing in a panorama while nothing else in it agrees. Each condition has a margin, which is 0 at its limit; the
+smallest margin is the run's score.
 """
 
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ from spherloc.consensus.chance import chance_rate, expected_text
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.evidence import MIN_SDS, agreeing, different, sd_of
+from spherloc.diagnosis.spread import spread_of
 from spherloc.free_gravity import MAX_NFA, MIN_LEAD, count_distinct, expected_by_chance, lead, nearby_support
 from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
@@ -37,7 +39,8 @@ class Outcome(StrEnum):
     LOCALIZED = "localized"
     """The pose is believed."""
     DOUBTFUL = "doubtful"
-    """There is a pose, but chance, an alternative pose, another gravity or its covariance speaks against it."""
+    """There is a pose, but chance, an alternative pose, another gravity, its covariance or where its inliers lie speaks
+    against it."""
     FAILED = "failed"
     """There is no pose."""
 
@@ -98,6 +101,7 @@ def _judge(trace: Trace) -> Judgement:
         _alternative_margin(trace, aligned, state, errors, size, rate, fixed_by),
         _gravity_margin(aligned, state, errors, inliers, trace.options),
         _error_margin(trace, aligned, state, inliers),
+        _spread_margin(trace, aligned, inliers),
     ]
     score = min(margin for margin, _ in found)
     reasons = tuple(reason for margin, reason in found if margin < 0.0)
@@ -165,3 +169,9 @@ def _error_margin(trace: Trace, aligned: AlignedProblem, state: FloatArray, inli
     worst = MIN_SDS * max(np.degrees(rotation) / SUCCESS_DEG, position / SUCCESS_M, 1e-300)
     fixed = f"{np.degrees(rotation):.2g}° and {position:.2g} {trace.problem.unit}"
     return -np.log(worst), f"Its inliers fix it to no better than {fixed} (1 sd)."
+
+
+def _spread_margin(trace: Trace, aligned: AlignedProblem, inliers: BoolArray) -> tuple[float, str]:
+    """Margin against an object or a facade that looks alike elsewhere."""
+    spread = spread_of(trace.problem.camera, aligned.bearings, inliers)
+    return (np.inf, "") if spread is None else (spread.margin, spread.sentence)

@@ -16,7 +16,7 @@ class Cause(StrEnum):
     FALSE_CONSENSUS = "larger false consensus"
     """A wrong pose explains more matches than the true one, so that no method by consensus finds the true one. Without
     the truth: a second pose explains many of the matches that the best one does not explain, but fewer than that
-    one."""
+    one; or what agrees lies on one thing in the view, and nothing else in it agrees."""
     WRONG_REFERENCE = "wrong reference image"
     """No match is right. Without the truth: no pose stands out, though there are so many matches that a right
     reference image would have given one."""

@@ -101,6 +101,8 @@ def without_truth(e: Evidence) -> Cause:
         return Cause.FALSE_CONSENSUS
     if missed(e, best):
         return Cause.ITERATIONS_RAN_OUT
+    if looks_alike(e):
+        return Cause.FALSE_CONSENSUS
     # The outcome asks for more: a pose that it doubts for that is not "ok".
     return Cause.DEGENERATE if e.reported_sd and undetermined(*(MIN_SDS * sd for sd in e.reported_sd)) else Cause.OK
 
@@ -156,6 +158,11 @@ def tilts(e: Evidence, tilt_rad: float, slack_rad: float) -> bool:
     excess = tilt_rad - e.believed_rad
     harm_px = excess * float(np.median(e.aligned.pixels_per_radian))
     return excess > slack_rad and harm_px > MIN_TILT_IN_BOUNDS * e.bound_px
+
+
+def looks_alike(e: Evidence) -> bool:
+    """Whether the run's pose rests on one thing in the view, which may stand elsewhere."""
+    return e.spread is not None and e.spread.margin < 0.0
 
 
 def missed(e: Evidence, best: int) -> bool:

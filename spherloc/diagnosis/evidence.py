@@ -11,6 +11,7 @@ from spherloc.bounds import Bounds, bounds_of
 from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.causes import Measures
+from spherloc.diagnosis.spread import Spread, spread_of
 from spherloc.estimators.base import estimate
 from spherloc.estimators.mc_exact import McExactOptions
 from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD, tilt_of
@@ -260,6 +261,9 @@ class Evidence:
     """The same two of the run's own pose, by which its outcome is judged; None without a pose."""
     verified_without_point: int
     """See ``Problem``."""
+    spread: Spread | None
+    """Where the matches that agree with the run's pose lie in a panorama; None if there are hardly any, and
+    for another camera."""
 
     def nfa(self, size: int, wider: float = 1.0, fixed_by: int = 2) -> float:
         """Expected number of false alarms (NFA) of that size within ``wider`` times the bound.
@@ -347,6 +351,9 @@ def gather(trace: Trace) -> Evidence:
         position_sd_m=sd[1],
         reported_sd=None if run is None else sd_of(aligned, run.cam_from_map, agreeing(trace, run.errors_px), options),
         verified_without_point=trace.problem.verified_without_point,
+        spread=None
+        if run is None
+        else spread_of(trace.problem.camera, aligned.bearings, agreeing(trace, run.errors_px)),
     )
 
 

@@ -67,6 +67,8 @@ def _advice(trace: Trace, e: Evidence, truth: Truth | None, cause: Cause) -> str
             )
     if cause is Cause.GRAVITY_OFF and e.believed_rad < e.aligned.gravity_bound_rad:
         return "Set gravity_sd_deg to what the problem states, or leave it out; then the refinement corrects the tilt."
+    if cause is Cause.FALSE_CONSENSUS and truth is None and not _strong(e):
+        return "Look whether the rest of the view fits, through the query's lens; add images of the place to the map."
     if cause is Cause.SEARCH_MISSED and trace.stage(ConsensusStage) is not None:
         return "Raise the effort and the time budget."
     return ADVICE[cause]
@@ -75,6 +77,8 @@ def _advice(trace: Trace, e: Evidence, truth: Truth | None, cause: Cause) -> str
 def _other(e: Evidence, truth: Truth | None, cause: Cause) -> Fit | None:
     """The pose to look at beside the run's own, if there is one."""
     if cause is Cause.OK:
+        return None
+    if cause is Cause.FALSE_CONSENSUS and truth is None and not _strong(e):
         return None
     if cause in (Cause.AMBIGUOUS, Cause.FALSE_CONSENSUS):
         candidates = [e.alternative, e.best] if truth is None else [truth.fit, e.alternative, e.best]
@@ -111,6 +115,8 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
             return f"{lacking} matches agree between the images but have no point in the map; {total} have one."
         case Cause.FALSE_CONSENSUS if truth is not None:
             return f"A wrong pose explains more than the true one: {best} of {total} matches against {second}."
+        case Cause.FALSE_CONSENSUS if e.spread is not None and not _strong(e):
+            return e.spread.sentence
         case Cause.FALSE_CONSENSUS:
             return f"Two different poses stand out, with {best} and {second} of {total} matches: either may be false."
         case Cause.AMBIGUOUS:
@@ -121,6 +127,11 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
         case Cause.UNKNOWN:
             return f"The pose is off the true one, though {run} of {total} matches agree with it and fix it well."
     return _measured_summary(e, truth, cause, unit)
+
+
+def _strong(e: Evidence) -> bool:
+    """Whether a second pose explains many of the matches that the best one does not explain."""
+    return e.best is not None and e.alternatives_own() >= STRONG * e.best.support(e.bound_px)
 
 
 UNLIKELY = 0.05

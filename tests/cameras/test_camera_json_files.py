@@ -86,7 +86,10 @@ def test_a_panorama_and_one_focal_length_in_transforms_json(tmp_path):
         ({"left": {**TABLE, "params": [1, 2]}}, "left.*key 'params' is .*give a list of 8 finite numbers"),
         ({"left": {**TABLE, "params": "many"}}, "left.*'params' is 'many': give a list"),
         ({"left": {**TABLE, "width": 6.5}}, "left.*key 'width' is 6.5"),
-        ({"left": {"model": "FISHEYE624", "size": [64, 48], "params": [1.0]}}, "left.*give a list of 15 finite numbers"),
+        (
+            {"left": {"model": "FISHEYE624", "size": [64, 48], "params": [1.0]}},
+            "left.*list of 15 finite numbers",
+        ),
         ({"left": {"model": "OPENCV", "params": []}}, "left.*key 'width' is missing"),
         ({**FISHEYE, "camera_model": "SPHERICAL"}, "camera_model 'SPHERICAL' is not supported"),
         ({**FISHEYE, "fl_x": "wide"}, "fl_x"),
