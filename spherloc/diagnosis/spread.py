@@ -6,6 +6,7 @@ there are many matches in the rest of it of which hardly any agrees. Other image
 may look at it with a small part of their view.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +22,7 @@ MAX_RADIUS_DEG = 50.0
 MIN_REST = 40
 """Least number of matches in the rest of the view that say something."""
 MAX_RATIO = 0.15
-"""Share of matches that agree in the rest of the view, divided by that in the part, below which hardly any does there.
-"""
+"""``Spread.ratio`` below which hardly any match agrees in the rest of the view."""
 MIN_AGREEING = 4
 MAX_CENTRES = 200
 """Largest number of directions that are tried as the middle of the part."""
@@ -44,12 +44,16 @@ class Spread:
     """Number of those that agree."""
 
     @property
+    def ratio(self) -> float:
+        """Share of matches that agree in the rest of the view, divided by that in the part; inf without a rest."""
+        return self.agreeing_rest * self.inside / (self.rest * self.agreeing_inside) if self.rest else np.inf
+
+    @property
     def margin(self) -> float:
         """Natural logarithm of how far it is from the limit beyond which the pose is doubted, which it is below 0."""
         if self.rest == 0:
             return np.inf
-        ratio = self.agreeing_rest * self.inside / (self.rest * self.agreeing_inside)
-        farthest = max(ratio / MAX_RATIO, self.radius_deg / MAX_RADIUS_DEG, MIN_REST / self.rest)
+        farthest = max(self.ratio / MAX_RATIO, self.radius_deg / MAX_RADIUS_DEG, MIN_REST / self.rest)
         return float(np.log(max(farthest, 1e-300)))
 
     @property
@@ -77,4 +81,15 @@ def spread_of(camera: Camera, bearings: FloatArray, agreeing: BoolArray) -> Spre
         agreeing_inside=int((inside & agreeing).sum()),
         rest=int((~inside).sum()),
         agreeing_rest=int((~inside & agreeing).sum()),
+    )
+
+
+def joined(spreads: Sequence[Spread]) -> Spread:
+    """The counts of several views added, with their mean radius."""
+    return Spread(
+        radius_deg=float(np.mean([spread.radius_deg for spread in spreads])),
+        inside=sum(spread.inside for spread in spreads),
+        agreeing_inside=sum(spread.agreeing_inside for spread in spreads),
+        rest=sum(spread.rest for spread in spreads),
+        agreeing_rest=sum(spread.agreeing_rest for spread in spreads),
     )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.diagnosis.spread import joined, spread_of
 from spherloc.frontend.feature_kinds import Descriptors
 from spherloc.frontend.features import Features
 from spherloc.frontend.matching import MatchOptions, match
@@ -39,6 +40,10 @@ PEAK = 1.7
 """Least ratio of the matches that fit a direction found through a third image to those that fit other directions."""
 LEAN_RAD = float(np.radians(1.5))
 """Angle by which the gravities of two images may differ under their relative pose, besides the bounds on gravity."""
+MANY_FIT, MIN_RATIO = 55, 1.0 / 3.0
+"""Two panoramas with fewer matches that fit than the first number, and a ``Spread.ratio`` below the second, may show
+one thing that stands at two places: so it is with all pairs whose pose is wrong in a rendered flat of rooms alike, and
+with few of the others."""
 MAX_LOG10_NFA = -1.0
 """Largest log10 of the NFA: the number of poses that as many of the matches would fit by chance."""
 
@@ -57,6 +62,7 @@ class ImagePairs:
     ) -> None:
         """``usable`` are the indices (K,) of each image's features for COLMAP, ``gravity`` that from vertical lines."""
         self._matching = matching
+        self._cameras = cameras
         self._pycolmap = pycolmap
         self._features = features
         height = round(pi * min(focal_px(camera) for camera in cameras))
@@ -116,6 +122,18 @@ class ImagePairs:
             return None
         off = rotation_angle(relative(geometry)[0] @ pose[0].T)
         return geometry if off <= OFF_RAD else None
+
+    def on_one_thing(self, first: int, second: int, pairs: NDArray[np.uint32], geometry: Any) -> bool:
+        """Whether what fits between two panoramas may be a thing that stands at two places: few of the matches (M, 2)
+        fit, and hardly any outside a part of the view."""
+        rays = self._bearings[first][pairs[:, 0]], self._bearings[second][pairs[:, 1]]
+        fits = fitting(*rays, *relative(geometry), self._bound_rad)
+        cameras = self._cameras[first], self._cameras[second]
+        spreads = [spread_of(camera, seen, fits) for camera, seen in zip(cameras, rays, strict=True)]
+        known = [spread for spread in spreads if spread is not None]
+        if len(known) < len(spreads):
+            return False
+        return np.count_nonzero(fits) < MANY_FIT and joined(known).ratio < MIN_RATIO
 
     def _geometry(self, first: int, second: int, pairs: NDArray[np.uint32]) -> Any:
         if len(pairs) < MIN_MATCHES:

@@ -400,6 +400,11 @@ def _matched(
         done += 1
         tell("pairs of images matched", done, len(waiting))
     same_place = {pair: found.pop(pair) for pair in sorted(found) if compared.same_place(found[pair])}
+    found = {
+        pair: geometry
+        for pair, geometry in found.items()
+        if not compared.on_one_thing(*pair, database.read_matches(*_of(ids, pair)), geometry)
+    }
     found = _agreeing(found)
     known = {pair: relative(geometry) for pair, geometry in found.items()}
     between = {pair: middles for pair, middles in open_triangles(known).items() if pair not in same_place}
