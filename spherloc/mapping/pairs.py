@@ -25,7 +25,7 @@ from spherloc.mapping.guided import guided_matches
 from spherloc.mapping.level_pairs import chance_of_fit, fitting, level_pair, log10_nfa
 from spherloc.mapping.rotations import OFF_RAD
 from spherloc.mapping.triangles import MIN_FIT, Pair, Relative, elsewhere, through
-from spherloc.types import FloatArray
+from spherloc.types import BoolArray, FloatArray
 
 MIN_MATCHES = 15
 """Least number of matches of a pair of images, after all checks."""
@@ -124,16 +124,10 @@ class ImagePairs:
         return geometry if off <= OFF_RAD else None
 
     def on_one_thing(self, first: int, second: int, pairs: NDArray[np.uint32], geometry: Any) -> bool:
-        """Whether what fits between two panoramas may be a thing that stands at two places: few of the matches (M, 2)
-        fit, and hardly any outside a part of the view."""
+        """Whether what fits of the matches (M, 2) may be a thing that stands at two places."""
         rays = self._bearings[first][pairs[:, 0]], self._bearings[second][pairs[:, 1]]
         fits = fitting(*rays, *relative(geometry), self._bound_rad)
-        cameras = self._cameras[first], self._cameras[second]
-        spreads = [spread_of(camera, seen, fits) for camera, seen in zip(cameras, rays, strict=True)]
-        known = [spread for spread in spreads if spread is not None]
-        if len(known) < len(spreads):
-            return False
-        return np.count_nonzero(fits) < MANY_FIT and joined(known).ratio < MIN_RATIO
+        return on_one_thing((self._cameras[first], self._cameras[second]), rays, fits)
 
     def _geometry(self, first: int, second: int, pairs: NDArray[np.uint32]) -> Any:
         if len(pairs) < MIN_MATCHES:
@@ -195,6 +189,15 @@ class ImagePairs:
     def same_place(self, geometry: Any) -> bool:
         """Whether the two images were taken from one place."""
         return geometry.config != self._pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+
+
+def on_one_thing(cameras: tuple[Camera, Camera], rays: tuple[FloatArray, FloatArray], fits: BoolArray) -> bool:
+    """Whether two panoramas show one thing that may stand at two places: few of their matches, with bearings (M, 3) in
+    each, fit a pose, and hardly any outside a part of the view. False for other cameras."""
+    spreads = [spread_of(camera, seen, fits) for camera, seen in zip(cameras, rays, strict=True)]
+    known = [spread for spread in spreads if spread is not None]
+    few = np.count_nonzero(fits) < MANY_FIT
+    return bool(few and len(known) == len(spreads) and joined(known).ratio < MIN_RATIO)
 
 
 def _unit(descriptors: Descriptors) -> NDArray[np.float32]:
