@@ -5,6 +5,8 @@ that cannot be imported or fails does not affect others: where it is used, one s
 """
 
 import importlib
+import shlex
+import sys
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -218,4 +220,7 @@ def require(module: str, extra: str, purpose: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError:
-        raise InputError(f"{purpose} needs {module}; install it with: pip install 'spherloc[{extra}]'.") from None
+        python = shlex.quote(sys.executable)
+        raise InputError(
+            f"{purpose} needs {module}; install it with: {python} -m pip install 'spherloc[{extra}]'."
+        ) from None

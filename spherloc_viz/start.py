@@ -1,9 +1,12 @@
 """Start of the command line, before anything large is imported: lists all commands on one screen if none is named."""
 
+import difflib
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from spherloc_viz.importing import importing
 
@@ -100,11 +103,24 @@ def answer(words: Sequence[str]) -> tuple[str, int] | None:
         return overview(), 2
     if len(words) == 1 and words[0] in HELP:
         return overview(), 0
+    if not words[0].startswith("-") and not any(words[0] in commands for commands in COMMANDS.values()):
+        return f"spherloc: {_no_command(words)}", 2
     if list(words) == ["--version"]:
         from importlib.metadata import version
 
         return f"spherloc {version('spherloc')}", 0
     return None
+
+
+def _no_command(words: Sequence[str]) -> str:
+    """What may have been meant where the first word is no command."""
+    known = [name for commands in COMMANDS.values() for name in commands]
+    near = difflib.get_close_matches(words[0], known, 1)
+    places = [word for word in words if word and Path(word).exists()]
+    if places and not near:
+        return f"{words[0]!r} is no command; to open {places[0]!r}: spherloc play {shlex.quote(places[0])}"
+    meant = f"did you mean {near[0]!r}? " if near else ""
+    return f"{words[0]!r} is no command; {meant}spherloc alone lists all commands."
 
 
 def overview() -> str:

@@ -19,7 +19,10 @@ from spherloc.errors import InputError
 from spherloc.estimators import estimate
 from spherloc.trace import Certificate
 from spherloc_viz.commands import run
+from spherloc_viz.commands.runs import print_runs
 from spherloc_viz.options import json_text
+from spherloc_viz.recording.index.query import RunQuery
+from spherloc_viz.start import answer
 from tests.needs import DATA, needs
 
 CAMERA = """
@@ -339,3 +342,25 @@ def test_the_first_screen_names_every_command_and_fits() -> None:
     nothing = start()
     assert (nothing.returncode, nothing.stdout) == (2, told.stdout)
     assert start("--version").stdout.strip() == f"spherloc {version('spherloc')}"
+
+
+def test_a_word_that_is_no_command_is_told_what_to_do(tmp_path: Path) -> None:
+    assert answer(["play"]) is None and answer(["--unknown"]) is None
+    told, code = answer(["open", str(tmp_path)]) or ("", 0)
+    assert code == 2 and f"to open '{tmp_path}': spherloc play {tmp_path}" in told
+    told, code = answer([str(tmp_path)]) or ("", 0)
+    assert code == 2 and f"spherloc play {tmp_path}" in told
+    told, code = answer(["localise", str(tmp_path)]) or ("", 0)
+    assert code == 2 and "did you mean 'localize'?" in told
+
+
+def test_runs_of_a_results_folder_are_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The recordings of a sequence lie in a folder of its results; the list above says so."""
+    results = tmp_path / "recordings" / "street_mc_0"
+    spherloc_here("run", SCENE, "--recordings", str(results / "recordings"), cwd=tmp_path)
+    capsys.readouterr()
+    print_runs(results, RunQuery(), None, None, "table")
+    assert "MEI fisheye" in capsys.readouterr().out
+    print_runs(tmp_path / "recordings", RunQuery(), None, None, "table")
+    told = capsys.readouterr()
+    assert "no run matches, of 0 runs" in told.err and f"There are others in {results / 'recordings'}." in told.err

@@ -461,7 +461,7 @@ def test_standard_deviations_are_those_of_the_covariance(mc: Trace) -> None:
         "position x, y, z": "1.0 cm, 2.0 cm, 2.0 cm",
         "tilt": "0.250°",
     }
-    assert "its error is 0.30° and 3.0 cm RMS." in picture.step.caption
+    assert "its expected error is 0.30° and 3.0 cm RMS." in picture.step.caption
     assert "leans 0.250° from the given gravity, which was trusted to 0.5°" in picture.step.note
     assert "tilt / σ_g" in picture.step.equation
     assert dict(outcome_table(trace).rows)["expected error"] == "0.30° and 3.0 cm RMS"

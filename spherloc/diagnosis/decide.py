@@ -113,7 +113,7 @@ def with_truth(e: Evidence, t: Truth) -> Cause:
     many = stands_out(e, right, t.within)
     if not many and map_is_sparse(e, right):
         return Cause.MAP_TOO_SPARSE
-    if right < 2 or right <= t.by_chance + CHANCE_SDS * np.sqrt(t.by_chance):
+    if right < 1 or right <= t.by_chance + CHANCE_SDS * np.sqrt(t.by_chance):
         return Cause.WRONG_REFERENCE
     if not many:
         return Cause.TOO_FEW_INLIERS

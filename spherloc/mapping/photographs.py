@@ -17,7 +17,7 @@ from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
-from spherloc.images import check_image, grey, read_image
+from spherloc.images import check_image, grey, read_image, read_size
 from spherloc.mapping.lens import for_colmap
 from spherloc.types import ByteArray
 
@@ -139,9 +139,29 @@ def new_images_of(folder: Path, mapped: Photographs, panorama: bool = False) -> 
         if not found.views:
             raise InputError(f"{folder}: no image is of a camera of the map. {' '.join(found.remarks)}")
         return NewImages(folder, found.views), found.remarks
-    if not any(map(is_image, names_in(folder))):
+    names = [name for name in names_in(folder) if is_image(name)]
+    if not names:
         raise InputError(f"{folder}: has no images; give a folder with images that are to be localized.")
-    return NewImages(folder, None), ()
+    camera = mapped.views[0].camera
+    others = [name for name in names if not _of_camera(folder / name, camera)]
+    size = f"{camera.width} x {camera.height} pixels, as the map's camera has"
+    if len(others) == len(names):
+        raise InputError(f"{folder}: none of its {len(names)} images can be read and has {size}; give others.")
+    if not others:
+        return NewImages(folder, None), ()
+    return NewImages(folder, None), (
+        f"{len(others)} of {len(names)} images will be left out, not {size}: {_some(others)}.",
+    )
+
+
+def _of_camera(path: Path, camera: Camera) -> bool:
+    """Whether an image can be read and is of the camera by its size; panoramas are of any size."""
+    try:
+        width, height = read_size(path)
+    except InputError:
+        return False
+    panorama = isinstance(camera, Equirectangular) and width == 2 * height
+    return panorama or (width, height) == (camera.width, camera.height)
 
 
 def _belonging(cameras: Mapping[str, Camera], folder: str, folders: Sequence[str]) -> Mapping[str, Camera]:
@@ -197,7 +217,8 @@ def _of_folder(
         told = ", ".join(f"{len(sizes[size])} of {size[0]} x {size[1]} pixels" for size in order[:MAX_NAMED])
         files = "their calibration" if len(sizes) == 1 else "a file with the calibrations of all of them"
         raise InputError(
-            f"{folder}: its photographs, {told}, are not full panoramas (2 to 1); give {files} with --camera FILE."
+            f"{folder}: its photographs, {told}, are not full panoramas (2 to 1); put {files} beside them, or give it "
+            "with --camera FILE."
         )
     if rest:
         width, height = next(size for size, names in sizes.items() if rest[0] in names)

@@ -159,8 +159,8 @@ def reconstruct(
             raise InputError(
                 f"{np.count_nonzero(np.triu(same_place))} pairs of the {len(views)} photographs match as if all were "
                 "taken from one place. If they were, add photographs from half a metre to two metres away; if not, "
-                "something moves along and is seen in each, such as a car or a tripod: leave it out with --mask or "
-                "--nadir."
+                "the calibration is wrong, or something moves along and is seen in each, such as a car or a tripod: "
+                "leave it out with --mask or --nadir."
             )
         raise InputError(
             f"no two of the {len(views)} photographs show the same place from two positions: the best pair has "

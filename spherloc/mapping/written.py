@@ -22,7 +22,6 @@ from spherloc.types import FloatArray
 
 MODEL = "model"
 SCENE = "scene.toml"
-NEW_SCENE = "new_images.toml"
 MIN_BOUND_DEG = 3.0
 EVERY = 4
 """Every fourth image of the map is a query of the scene file, localized against the others."""
@@ -91,12 +90,18 @@ def write_map(
         scene.write_text(content + _kept(kept, folder), encoding="utf-8")
         new_scene = None
         if new_images is not None:
-            new_scene = folder / NEW_SCENE
+            new_scene = folder / f"{_file_name(new_images.folder)}.toml"
             content = _new_scene(folder, images, new_images, views[0].camera, about, level, scale)
             new_scene.write_text(content + _kept(kept, folder), encoding="utf-8")
     except (OSError, RuntimeError) as error:
         raise InputError(f"{folder}: cannot be written ({error}); give another --output.") from None
     return Written(scene, new_scene, poses, made.points(), float(made.model.compute_mean_reprojection_error()))
+
+
+def _file_name(new_images: Path) -> str:
+    """What the scene file of new images is called: as their folder, so that several folders have one each."""
+    name = new_images.resolve().name
+    return f"new_{name}" if f"{name}.toml" == SCENE else name
 
 
 def _about(made: Reconstruction, level: Level, scale: MapScale, count: int) -> str:

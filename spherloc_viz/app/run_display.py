@@ -226,7 +226,7 @@ class RunDisplay:
             trace=trace,
             items=tuple(item for item in picture.scene if item.layer in layers),
             backdrop=mesh if "mesh" in layers else None,
-            title=run.request.scene.scene,
+            title=trace.problem.name,
             note=f"{picture.step.title} · {trace.estimator}, seed {trace.seed}{outcome}",
             recorded=recorded,
             dark=display.theme == "dark",

@@ -318,8 +318,10 @@ def _each(results: SequenceResults) -> Iterator[str]:
         off = ""
         if turned is not None and moved is not None:
             off = f", expected error {turned:.2g} deg and {results.configuration.length(moved)}"
+        at = ", ".join(f"{value:.2f}" for value in row.position_m)
         why = f" ({row.diagnosis})" if row.diagnosis not in (None, str(Cause.OK)) else ""
-        yield f"{row.query}: {row.status}{why}, {row.inliers or 0:,} of {row.matches or 0:,} matches agree{off}"
+        agree = f"{row.inliers or 0:,} of {row.matches or 0:,} matches agree"
+        yield f"{row.query}: {row.status}{why}, at ({at}), {agree}{off}"
 
 
 def _trajectory_lines(error: TrajectoryError | None, setting: Configuration) -> Iterator[str]:

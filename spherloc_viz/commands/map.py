@@ -14,7 +14,7 @@ import shlex
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -108,6 +108,8 @@ def make(
         print(f"new images    {_sizes(others)}")
     print(f"see it        spherloc play {made.written.scene}")
     print(f"localize      spherloc localize {made.written.new_scene or made.written.scene}")
+    for group in made.groups if others is not None else ():
+        print(f"or there      spherloc localize {group.written.new_scene}")
     return 0 if len(made.written.poses) == len(found.views) else 1
 
 
@@ -253,6 +255,8 @@ MAX_THUMBNAILS = 40
 MAX_NAMED = 30
 """Largest number of images whose names stand in the picture from above."""
 MAX_POINTS = 20_000
+CLOSE = 0.15
+"""If the images lie within this share of the picture, a second one shows them alone."""
 WITHIN = 0.98
 """Share of the points that the picture shows: a few far points would make the others too small."""
 
@@ -281,7 +285,7 @@ def map_report(made: Map, found: Photographs) -> str:
     }
     rows = [_row(made, names, index) for index in range(len(views))]
     left = [view for view in views if view.name not in written.poses]
-    unit = "metres" if made.scale.source else "units"
+    above = _from_above(made, cameras_of(views).values(), "metres" if made.scale.source else "units")
     return "\n".join(
         [
             '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Map</title>',
@@ -289,10 +293,10 @@ def map_report(made: Map, found: Photographs) -> str:
             "<table>",
             *(f"<tr><th>{key}</th><td>{html.escape(value)}</td></tr>" for key, value in facts.items()),
             "</table>",
-            *(f'<p class="out">{html.escape(remark)}</p>' for remark in found.remarks),
+            *(f"<p>{html.escape(remark)}</p>" for remark in found.remarks),
             *_doubts(made),
             "<h2>From above</h2>",
-            f'<img alt="Points and cameras of the map from above" src="{_from_above(made, unit)}">',
+            f'<img alt="Points and cameras of the map from above" src="{above}">',
             "<h2>Not in the map</h2>" if left else "",
             *(_thumbnail(view, made, names) for view in left[:MAX_THUMBNAILS]),
             "<h2>Images</h2><table><tr><th>image</th><th>in the map</th><th>best partner</th><th>matches</th>"
@@ -377,23 +381,30 @@ def _thumbnail(view: View, made: Map, names: list[str]) -> str:
     return f'<p><img alt="" src="{_data("jpeg", content.tobytes())}"><br>{reason}</p>'
 
 
-def _from_above(made: Map, unit: str) -> str:
+def _from_above(made: Map, cameras: Collection[Camera], unit: str) -> str:
     """Address of a PNG."""
     points = made.written.points
     centres = np.stack([camera_centre(pose) for pose in made.written.poses.values()])
-    figure = Figure(figsize=(9, 6.5), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot(aspect="equal")
     shown = points[_near(points, centres)]
     shown = shown[:: max(1, len(shown) // MAX_POINTS)]
+    extent = float(np.ptp(centres[:, :2], axis=0).max())
+    close = 0.0 < extent < CLOSE * float(np.ptp(shown[:, :2], axis=0).max(initial=0.0))
+    figure = Figure(figsize=(14 if close else 9, 6.5), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(1, 2 if close else 1, 1, aspect="equal", adjustable="datalim")
     axes.scatter(shown[:, 0], shown[:, 1], s=1.5, c="#8fa3b8", linewidths=0)
-    axes.plot(centres[:, 0], centres[:, 1], color="#d08a1c", linewidth=0.8)
+    if close:
+        axes.scatter(centres[:, 0], centres[:, 1], s=28, c="#c0392b", zorder=3)
+        axes.set(xlabel=unit, ylabel=unit)
+        axes = figure.add_subplot(1, 2, 2, aspect="equal", adjustable="datalim", title="the cameras alone")
+    if len(cameras) == 1:  # those of several do not follow each other by their names
+        axes.plot(centres[:, 0], centres[:, 1], color="#d08a1c", linewidth=0.8)
     axes.scatter(centres[:, 0], centres[:, 1], s=28, c="#c0392b", zorder=3)
     if len(centres) <= MAX_NAMED:
         for name, centre in zip(made.written.poses, centres, strict=True):
             axes.text(centre[0], centre[1], f"  {name}", fontsize=8, va="center", parse_math=False, clip_on=True)
-    axes.set_xlabel(unit)
-    axes.set_ylabel(unit)
+    axes.set(xlabel=unit, ylabel=unit)
+    axes.margins(0.2)
     file = io.BytesIO()
     figure.savefig(file, format="png", metadata={"Software": None})
     return _data("png", file.getvalue())

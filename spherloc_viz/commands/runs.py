@@ -9,6 +9,8 @@ from pathlib import Path
 from spherloc import registry
 from spherloc.diagnosis import Cause
 from spherloc.errors import InputError, RecordingError, show
+from spherloc.files import is_folder, names_in
+from spherloc_viz.commands.flags import RECORDINGS
 from spherloc_viz.commands.progress import progress, say
 from spherloc_viz.given_files import check_recording_file, check_recordings_folder, is_recording
 from spherloc_viz.recording.index.query import GROUP_KEYS, OUTCOMES, SORT_KEYS, SOURCES, RunQuery
@@ -43,6 +45,8 @@ def print_runs(folder: Path, query: RunQuery, group: str | None, limit: int | No
     """
     most = _limit(limit, form)
     key = None if group is None else one_of("group", group.replace("-", "_"), GROUP_KEYS)
+    if not _has_recordings(folder) and _has_recordings(folder / RECORDINGS):
+        folder = folder / RECORDINGS  # of results that spherloc localize has written
     with _open(folder) as index:
         _refresh(index)
         _check_known(index, query)
@@ -55,10 +59,21 @@ def print_runs(folder: Path, query: RunQuery, group: str | None, limit: int | No
         found = index.find(query, most)
         print(rows_text(folder, found.rows, form), end="", flush=True)
         if not found.total:
-            say(f"no run matches, of {_count(index.find(RunQuery(), 1).total, 'run')} in {folder}.")
+            say(f"no run matches, of {_count(index.find(RunQuery(), 1).total, 'run')} in {folder}.{_elsewhere(folder)}")
         elif len(found.rows) < found.total:
             say(f"{len(found.rows):,} of {found.total:,} runs; --limit 0 shows all.")
     return 0
+
+
+def _has_recordings(folder: Path) -> bool:
+    return is_folder(folder) and any(name.endswith(".rrd") for name in names_in(folder))
+
+
+def _elsewhere(folder: Path) -> str:
+    """Where runs are that ``spherloc localize`` has recorded beside its results."""
+    places = [folder / name / RECORDINGS for name in names_in(folder)]
+    found = [place for place in places if _has_recordings(place)]
+    return f" There are others in {', '.join(map(str, found[:3]))}{', …' if len(found) > 3 else ''}." if found else ""
 
 
 def print_steps(folder: Path, condition: str, limit: int | None, form: str) -> int:

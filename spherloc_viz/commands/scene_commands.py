@@ -10,6 +10,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from spherloc.errors import InputError
+from spherloc.files import is_file, is_folder
 from spherloc_viz import given_files
 from spherloc_viz.commands.flags import (
     INTERRUPTED,
@@ -177,13 +178,15 @@ def localize(
         os._exit(INTERRUPTED)
 
 
-COMMON_STEMS = ("scene", "new_images")
-"""Names that `spherloc map` gives to the scene files of every map."""
-
-
 def _results_name(path: Path) -> str:
-    """What results of a scene file are called: its name, after that of its folder where many are called so."""
-    return f"{path.resolve().parent.name}_{path.stem}" if path.stem in COMMON_STEMS else path.stem
+    """What results of a scene file are called: its name, in a map after that of the map, and of the group in it."""
+    from spherloc.mapping.written import MODEL, SCENE
+
+    names, folder = [path.stem], path.resolve().parent
+    while is_file(folder / SCENE) and is_folder(folder / MODEL):
+        names.insert(0, folder.name)
+        folder = folder.parent
+    return "_".join(names)
 
 
 def _name_and_options(text: str, common: Sequence[Sequence[str]]) -> tuple[str, tuple[str, ...]]:

@@ -105,7 +105,7 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
         caption += "The truth is unknown: only the matches speak for it or against it."
         limits = ""
     else:
-        limits = "success: error < 1° and < 0.1 m   (Sec. VI-A)"
+        limits = f"success: error < 1° and < {SUCCESS_M:g} {trace.problem.unit}   (Sec. VI-A)"
         verdict = "a success" if metrics.success else "a failure"
         angle, length = angle_text(metrics.rotation_error_deg), view.length(metrics.translation_error_m)
         limit = view.length(SUCCESS_M)

@@ -186,7 +186,8 @@ def _summary(view: RunView, stage: RefinementStage) -> Frame:
     return Frame(
         f"{_steps(len(rms) - 1)} in {stage.dof} degrees of freedom {'takes' if len(rms) == 2 else 'take'} the inliers "
         f"from {rms[0]:.2f} to {rms[-1]:.2f} px RMS, and their number from {counts[0]} to {counts[-1]}. "
-        f"The camera ends at {view.position(state)}, and its error is {uncertainty.spread(stage, view.metric)}.",
+        f"The camera ends at {view.position(state)}, and its expected error "
+        f"is {uncertainty.spread(stage, view.metric)}.",
         _objective(stage),
         state,
         view.colors(style.UNDECIDED, (mask, style.INLIER)),

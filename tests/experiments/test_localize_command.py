@@ -21,13 +21,13 @@ from sequence_samples import true_pose, write_scene
 from spherloc import registry
 from spherloc.errors import SpherlocError
 from spherloc.experiments import read_results
-from spherloc.mapping.written import NEW_SCENE, SCENE
+from spherloc.mapping.written import MODEL, SCENE
 from spherloc.trajectory import read_tum
 from spherloc.warm_up import warm_up
 from spherloc_viz.commands.bundled import all_scenes, one_kind
 from spherloc_viz.commands.localize import Solving, compare_sequences, localize_sequence
 from spherloc_viz.commands.run import Records
-from spherloc_viz.commands.scene_commands import COMMON_STEMS, _results_name
+from spherloc_viz.commands.scene_commands import _results_name
 from spherloc_viz.plots import trajectory_png
 from spherloc_viz.recording.content.data import read_recording
 from tests.cli_process import spherloc_here
@@ -224,9 +224,16 @@ def test_wrong_words_are_one_sentence(tmp_path: Path) -> None:
 
 
 def test_results_of_two_maps_do_not_meet(tmp_path: Path) -> None:
-    assert {Path(SCENE).stem, Path(NEW_SCENE).stem} == set(COMMON_STEMS), "what every map calls its scene files"
-    maps = [tmp_path / name / NEW_SCENE for name in ("attic_map", "cellar_map")]
-    assert [_results_name(path) for path in maps] == ["attic_map_new_images", "cellar_map_new_images"]
+    """Nor do those of the groups in them."""
+    places = [tmp_path / name for name in ("attic_map", "cellar_map", "cellar_map/group_2")]
+    for place in places:
+        (place / MODEL).mkdir(parents=True)
+        (place / SCENE).touch()
+    assert [_results_name(place / "new.toml") for place in places] == [
+        "attic_map_new",
+        "cellar_map_new",
+        "cellar_map_group_2_new",
+    ]
     assert _results_name(tmp_path / "street.toml") == "street"
 
 

@@ -498,7 +498,12 @@ def test_new_images_are_counted_by_their_size(tmp_path, rng):
     (empty / "notes.txt").write_text("nothing")
     assert _sizes(NewImages(new, None)) == "2 of 400 x 200 pixels, 1 of 300 x 200 pixels, 1 damaged"
     mapped = Photographs(tuple(view for view in photographs(new, {}).views if view.camera.width == 400), (), {})
-    assert new_images_of(new, mapped) == (NewImages(new, None), ())
+    others = "2 of 4 images will be left out, not 400 x 200 pixels, as the map's camera has: c.png, d.jpg."
+    assert new_images_of(new, mapped) == (NewImages(new, None), (others,))
+    for name in ("a.png", "b.png"):
+        (new / name).unlink()
+    with pytest.raises(InputError, match="none of its 2 images can be read and has 400 x 200 pixels, as the map's"):
+        new_images_of(new, mapped)
     with pytest.raises(InputError, match="empty: has no images; give a folder with images that are to be localized"):
         new_images_of(empty, mapped)
 

@@ -4,7 +4,7 @@ import json
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -68,8 +68,7 @@ class MapPanel:
             self._process, stopped = None, self._stopped
         self._bar.visible = self._stop.visible = False
         if "scene" in said:
-            lines = "".join(f"<div>{escape(line)}</div>" for line in said["summary"])
-            self._text.content = box(lines, "font-size:12px;white-space:pre-wrap;overflow-wrap:anywhere")
+            self._text.content = box(_table(said["summary"]), "font-size:12px;overflow-wrap:anywhere")
             self._finished(Path(said["scene"]))
         elif stopped:
             self._say("Stopped; what was done is kept for the next time.")
@@ -79,6 +78,16 @@ class MapPanel:
 
     def _say(self, words: str) -> None:
         self._text.content = status_html(words)
+
+
+def _table(lines: Sequence[str]) -> str:
+    """Lines of a map's summary, each a name and, after two spaces or more, what there is to say."""
+    rows = []
+    for line in lines:
+        name, told, rest = line.partition("  ")
+        cells = f"<td style='padding-right:8px'>{escape(name)}</td><td>{escape(rest.strip())}</td>"
+        rows.append(f"<tr style='vertical-align:top'>{cells if told else f'<td colspan=2>{escape(line)}</td>'}</tr>")
+    return f"<table>{''.join(rows)}</table>"
 
 
 def _parsed(line: str) -> dict[str, Any] | None:

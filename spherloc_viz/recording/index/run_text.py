@@ -135,7 +135,11 @@ def _table(columns: Mapping[str, tuple[Any, str]], rows: Sequence[Mapping[str, s
 
 
 def _cut(text: str, width: int) -> str:
-    return text if len(text) <= width else text[: width - 1] + "…"
+    """The text, or its beginning and its end, where names of one scene differ."""
+    if len(text) <= width:
+        return text
+    end = (width - 1) // 2
+    return f"{text[: width - 1 - end]}…{text[-end:]}"
 
 
 def _with_files(folder: Path, rows: Sequence[RunRow], lines: Sequence[str]) -> list[str]:
