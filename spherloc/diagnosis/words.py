@@ -105,7 +105,7 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
         case Cause.TOO_FEW_INLIERS if truth is not None:
             right = int(np.count_nonzero(truth.right))
             lucky = " The pose is right all the same, which only the truth can tell." if truth.success else ""
-            return f"Only {right} of {total} matches {_is(right)} right, {_by_chance(e, right, truth.within)}.{lucky}"
+            return f"Only {right} of {total} matches {'is' if right == 1 else 'are'} right, {_by_chance(e, right, truth.within)}.{lucky}"
         case Cause.TOO_FEW_INLIERS:
             return f"Only {best} of {total} matches agree with any pose, {_by_chance(e, best)}."
         case Cause.WRONG_REFERENCE:
@@ -254,14 +254,11 @@ def _truths(trace: Trace, e: Evidence, truth: Truth) -> Iterator[str]:
     right, metrics = int(np.count_nonzero(truth.right)), evaluate(trace)
     at, near = truth.exact.support(e.bound_px), truth.fit.support(e.bound_px)
     more = f", {near} with a pose fitted near it" if near > at else ""
-    yield f"Truth: {right} match{'' if right == 1 else 'es'} {_is(right)} right, and {at} agree with the true pose{more}."
+    what = "match is" if right == 1 else "matches are"
+    yield f"Truth: {right} {what} right, and {at} agree with the true pose{more}."
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         error = f"{metrics.translation_error_m:.3g} {trace.problem.unit} and {metrics.rotation_error_deg:.3g}°"
         yield f"Truth: the run's pose is off by {error}; the known gravity by {_deg(truth.exact.tilt_rad)}."
-
-
-def _is(count: int) -> str:
-    return "is" if count == 1 else "are"
 
 
 def _deg(angle_rad: float) -> str:
