@@ -105,7 +105,8 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
         case Cause.TOO_FEW_INLIERS if truth is not None:
             right = int(np.count_nonzero(truth.right))
             lucky = " The pose is right all the same, which only the truth can tell." if truth.success else ""
-            return f"Only {right} of {total} matches {'is' if right == 1 else 'are'} right, {_by_chance(e, right, truth.within)}.{lucky}"
+            are = "is" if right == 1 else "are"
+            return f"Only {right} of {total} matches {are} right, {_by_chance(e, right, truth.within)}.{lucky}"
         case Cause.TOO_FEW_INLIERS:
             return f"Only {best} of {total} matches agree with any pose, {_by_chance(e, best)}."
         case Cause.WRONG_REFERENCE:
