@@ -257,7 +257,7 @@ def test_each_format_and_its_pixel_centre(written, text, name, expected):
         ("parameter: 3", None, "key 'image' is missing"),
         ("image: 3\nparameter: 3", None, "image: the camera is 3"),
         ("image: {width: 3, height: 3}\nparameter: 3", None, "parameter: the camera is 3"),
-        ("{}", None, "this JSON has no 'value0' at its top"),
+        ("{}", None, "this JSON has neither 'value0', cameras with 'model' and 'params', nor 'fl_x'"),
         ("{]", None, "line 1 is not valid JSON (Expecting property name"),
         ('{"value0": ' + "[" * 100_000, None, "a value is not valid JSON (maximum recursion depth exceeded"),
         ('{"value0": ' + "9" * 10_000 + "}", None, "a value is not valid JSON (Exceeds the limit"),
