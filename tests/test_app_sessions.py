@@ -226,6 +226,19 @@ def test_stepping_solves_nothing(house: House, monkeypatch: pytest.MonkeyPatch) 
     assert len(house.notes.traces) == 1
 
 
+def test_the_view_of_balls_goes_to_the_step_that_shows_them(house: House) -> None:
+    """From the outcome, which shows none; from a step that does, it stays."""
+    page, session = house.visit()
+    display = session._display
+    page.set(display.controls.display._views, "Balls")
+    until(lambda: display.step_key == "clique")
+    display.panels.steps.go("balls")
+    until(lambda: display.step_key == "balls")
+    page.set(display.controls.display._views, "Balls")
+    until(lambda: display.controls.display.wanted_view is None)
+    assert display.step_key == "balls"
+
+
 def test_play_goes_to_the_end_and_stops(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
     from spherloc_viz.app.controls import steps_panel
 

@@ -237,6 +237,12 @@ def test_a_card_says_at_which_stage_a_match_was_lost(scene_of: SceneOf) -> None:
     assert any(not trace.inlier_mask[number] for number in located), "some are lost after all stages"
 
 
+def _outside(stage: TranslationStage) -> int:
+    """A ball that is not in the clique, of a pair that has no other."""
+    members = {tuple(pair) for pair in stage.pairs[stage.clique].tolist()}
+    return next(ball for ball, pair in enumerate(stage.pairs.tolist()) if tuple(pair) not in members)
+
+
 def test_what_several_have_in_common(trace: Trace) -> None:
     right = trace.problem.truth_inliers
     assert right is not None
@@ -249,6 +255,11 @@ def test_what_several_have_in_common(trace: Trace) -> None:
     pairs, lo, _ = yaw_arcs(aligned, run_bounds(trace).radians)
     own = np.flatnonzero((pairs == inliers[:2]).all(axis=1))
     assert f"{np.degrees(lo[own[0]]):.1f}° to" in two.sentences[0] and len(own) == two.sentences[0].count(" to ")
+    stage = trace.stage(TranslationStage)
+    assert stage is not None
+    for ball, words in ((int(stage.clique[0]), "is in"), (_outside(stage), "is not in")):
+        told = explain_many(trace, stage.pairs[ball]).sentences[1]
+        assert told.startswith("Their ball has a radius of ") and told.endswith(f"{words} the maximum clique.")
     failed = explain_many(lost(trace, right), inliers[:6])
     assert any("6 agree with the true pose and not with the estimated one" in words for words in failed.sentences)
 

@@ -74,6 +74,10 @@ class Places:
     """The scene with images of that label, if it is one."""
 
 
+BALLS_STEP = "clique"
+"""The step to which the view "Balls" goes from one that shows none."""
+
+
 class RunDisplay:
     """One client's page. Everything is drawn on the session's page thread."""
 
@@ -159,6 +163,10 @@ class RunDisplay:
             run, blank = self._untold(run, withheld)
         trace = run.trace
         timeline = steps(trace)
+        at_hand = self._shown[2].step.stage if self._shown is not None else ""
+        balls = controls.display.wanted_view == "Balls" and at_hand != "Translation"
+        if balls and any(step.key == BALLS_STEP for step in timeline):
+            self.panels.steps.go(BALLS_STEP)
         index, pause = self.panels.steps.advance(timeline, asked)
         picture, last = paint(trace, index), index == len(timeline) - 1
         early = "outcome" in withheld and not last
@@ -184,7 +192,8 @@ class RunDisplay:
             told = replace(picture, step=drawn.step)
             outcome = early_table(trace, known_judgement(known.trace))
             offered = hidden_html(withheld, not presenter) if withheld else ""
-            self.panels.draw(blank if early else run, told, pause is not None, outcome, selected, early, offered)
+            cause = str(diagnosis.cause) if last and diagnosis is not None and diagnosis.doubtful else ""
+            self.panels.draw(blank if early else run, told, pause is not None, outcome, selected, early, offered, cause)
             waiting = "" if hidden else status_html("Diagnosing …")
             self.panels.diagnose(waiting if diagnosis is None else diagnosis_html(diagnosis, whole=last))
             self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, early)

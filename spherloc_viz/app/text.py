@@ -142,10 +142,11 @@ def summary_of(trace: Trace) -> tuple[str, list[str]]:
     return verdict(trace, metrics.success), facts
 
 
-def summary_html(trace: Trace) -> str:
-    """A run in one line."""
+def summary_html(trace: Trace, cause: str = "") -> str:
+    """A run in one line; ``cause`` is what is wrong with it, if that is to be told."""
     words, facts = summary_of(trace)
-    line = f'<b style="{_value_css(words)}">{escape(words.capitalize())}</b> · ' + " · ".join(map(escape, facts))
+    told = f"{words.capitalize()}: {cause}" if cause else words.capitalize()
+    line = f'<b style="{_value_css(words)}">{escape(told)}</b> · ' + " · ".join(map(escape, facts))
     return box(line, "font-size:12.5px;padding-top:.2em")
 
 

@@ -154,8 +154,8 @@ def early_table(trace: Trace, judged: Judgement | None) -> Table:
     within = f", {explained} within the bound on the noise" if explained < inliers else ""
     rows.append(("inliers", f"{inliers} of {len(trace.problem)}{within}"))
     if metrics.precision is not None and metrics.recall is not None and metrics.f1 is not None:
-        rows.append(("precision / recall", f"{100 * metrics.precision:.0f} % / {100 * metrics.recall:.0f} %"))
-        rows.append(("F1", f"{100 * metrics.f1:.0f} %"))
+        rows.append(("precision / recall", f"{100 * metrics.precision:.3g} % / {100 * metrics.recall:.3g} %"))
+        rows.append(("F1", f"{100 * metrics.f1:.3g} %"))
     if trace.certificate is not None:
         rows += _certificate_rows(trace.certificate, explained)
     stages = ", ".join(f"{name} {value:.1f}" for name, value in trace.timings_ms.items() if name != "total")

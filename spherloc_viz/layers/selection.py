@@ -14,7 +14,7 @@ from spherloc.types import ByteArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.agreement import agreement, subset
-from spherloc_viz.layers.frame import even, level_circles, one_color
+from spherloc_viz.layers.frame import even, length, level_circles, one_color
 from spherloc_viz.layers.primitives import Balls, Picture, Points, SceneItem, Segments
 from spherloc_viz.layers.residuals import run_bounds, verdicts
 
@@ -221,7 +221,7 @@ def explain_many(trace: Trace, numbers: IntArray) -> Traits:
         median_px=float(np.median(known_errors)) if len(known_errors) else None,
         agree=agree,
         pairs=pairs,
-        sentences=tuple(filter(None, (*_pair(trace, places), *_common(trace, numbers)))),
+        sentences=tuple(filter(None, (*_pair(trace, places), *_ball(trace, numbers), *_common(trace, numbers)))),
     )
 
 
@@ -246,6 +246,19 @@ def _pair(trace: Trace, places: IntArray) -> tuple[str, ...]:
         return ("Their pair has no yaw arc: no yaw explains both, or they are too close to say anything.",)
     arcs = " and ".join(f"{_degrees(a)} to {_degrees(b)}" for a, b in zip(lo, hi, strict=True))
     return (f"Their pair has {'one yaw arc' if len(lo) == 1 else f'{len(lo)} yaw arcs'}: {arcs}.",)
+
+
+def _ball(trace: Trace, numbers: IntArray) -> tuple[str, ...]:
+    """A sentence on the ball of camera positions of two correspondences."""
+    stage = trace.stage(TranslationStage)
+    if len(numbers) != 2 or stage is None:
+        return ()
+    own = np.flatnonzero(np.isin(stage.pairs, numbers).all(axis=1))
+    if not len(own):
+        return (f"None of the run's {len(stage.pairs):,} balls is of their pair.",)
+    radius = length(float(stage.radii_m[own[0]]), trace.problem.metric)
+    member = "is in" if np.isin(own, stage.clique).any() else "is not in"
+    return (f"Their ball has a radius of {radius} and {member} the maximum clique.",)
 
 
 def _degrees(angle_rad: float) -> str:

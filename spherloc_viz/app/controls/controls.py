@@ -96,6 +96,11 @@ class DisplayControls:
         """Layers that are switched on."""
         return frozenset(name for name, widget in self._layers.items() if widget.value)
 
+    @property
+    def wanted_view(self) -> str | None:
+        """The view that ``take_view`` will return."""
+        return self._wanted
+
     def take_view(self) -> str | None:
         """The view that was asked for since the last call, if any."""
         wanted, self._wanted = self._wanted, None

@@ -27,6 +27,10 @@
   }, true);
 
   addEventListener("pointercancel", () => { down = null; }, true);
+  // A checkbox that was clicked would keep the focus, and with it the keys of the steps.
+  addEventListener("click", (event) => {
+    if (event.detail > 0 && event.target instanceof HTMLInputElement && event.target.type === "checkbox") event.target.blur();
+  });
   addEventListener("keydown", () => clearTimeout(leaving), true);
 
   addEventListener("click", (event) => {
