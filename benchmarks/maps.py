@@ -1,0 +1,108 @@
+"""Maps of rendered panoramas whose true positions are known: a Markdown table of right and wrong images.
+
+    .venv/bin/python -m benchmarks.maps [apartment:12 campus:20 ...]     # some four minutes for the default ones
+
+A world and a number of panoramas, evenly along its path, are one row. Each of the maps that ``spherloc map`` makes of
+them is put onto the truth by the similarity that most of its images agree with; an image that is then more than
+``WRONG_M`` off is wrong. Maps of two images are not judged. Needs the extra ``colmap``.
+"""
+
+import argparse
+from itertools import combinations
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+
+from spherloc.datasets.scene_file import load_scene
+from spherloc.errors import InputError
+from spherloc.experiments.summary import align
+from spherloc.geometry import camera_centre
+from spherloc.mapping.make import ScaleMeasurement, make_map
+from spherloc.mapping.photographs import photographs
+from spherloc.types import FloatArray
+
+SETS = ("apartment:10", "apartment:12", "apartment:16", "apartment:22", "campus:12", "campus:20")
+WRONG_M = 0.25
+FEW = 3
+"""Images that fix a similarity."""
+SCENE = """
+kind = "rendered"
+name = "{world}"
+world = "{world}"
+[camera]
+model = "equirectangular"
+width = 896
+height = 448
+[references]
+count = {count}
+[queries]
+count = 1
+start = 0.5
+stop = 0.6
+"""
+
+
+def photographed(world: str, count: int, folder: Path) -> dict[str, FloatArray]:
+    """Write the panoramas into a folder; returns their true positions (3,), metres, by name."""
+    path = folder.with_suffix(".toml")
+    path.write_text(SCENE.format(world=world, count=count))
+    folder.mkdir()
+    places = {}
+    for view in load_scene(path).references:
+        name = f"{view.name}.png"
+        cv2.imwrite(str(folder / name), view.read())
+        places[name] = camera_centre(view.cam_from_map)
+    return places
+
+
+def errors_m(poses: dict[str, FloatArray], places: dict[str, FloatArray]) -> FloatArray:
+    """Distances (K,) to the truth after the similarity of three images that most images agree with."""
+    found = np.array([camera_centre(poses[name]) for name in sorted(poses)])
+    true = np.array([places[name] for name in sorted(poses)])
+    best = np.full(len(found), np.inf)
+    for three in combinations(range(len(found)), FEW):
+        chosen = list(three)
+        aligned = align(found[chosen], true[chosen], with_scale=True)
+        if aligned is None:
+            continue
+        scale, rotation, offset = aligned
+        off = np.linalg.norm(scale * found @ rotation.T + offset - true, axis=1)
+        if (np.count_nonzero(off > WRONG_M), off.sum()) < (np.count_nonzero(best > WRONG_M), best.sum()):
+            best = off
+    return best
+
+
+def row(world: str, count: int) -> str:
+    """One line of the table."""
+    with TemporaryDirectory() as place:
+        folder = Path(place) / "panoramas"
+        places = photographed(world, count, folder)
+        views = photographs(folder, {}).views
+        try:
+            made = make_map(views, folder, Path(place) / "map", ScaleMeasurement(), None, lambda *_: None)
+        except InputError as error:
+            return f"| {world}, {count} | none: {error} | | | |"
+        maps = [one.written.poses for one in (made, *made.groups)]
+        off = [errors_m(poses, places) for poses in maps if len(poses) >= FEW]
+        pairs = sum(len(poses) < FEW for poses in maps)
+    joined = np.concatenate(off) if off else np.empty(0)
+    wrong, right = np.count_nonzero(joined > WRONG_M), joined[joined <= WRONG_M]
+    sizes = " + ".join(str(len(errors)) for errors in off) + (f" and {pairs} of two" if pairs else "")
+    median = f"{100 * np.median(right):.1f}" if len(right) else "-"
+    return f"| {world}, {count} | {sizes} | {len(right)} | {wrong} | {median} |"
+
+
+def main() -> None:
+    """Print the table."""
+    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    words.add_argument("sets", nargs="*", default=SETS, metavar="WORLD:COUNT")
+    print("| panoramas | maps of | right | wrong | median of the right ones, cm |\n|---|---|---|---|---|")
+    for one in words.parse_args().sets:
+        world, _, count = one.partition(":")
+        print(row(world, int(count)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
