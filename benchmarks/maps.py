@@ -30,6 +30,7 @@ FEW = 3
 SCENE = """
 kind = "rendered"
 name = "{world}"
+provenance = "spherloc"
 world = "{world}"
 [camera]
 model = "equirectangular"

@@ -18,7 +18,7 @@ from spherloc.consensus.chance import chance_rate, expected_text
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.evidence import MIN_SDS, agreeing, different, sd_of
-from spherloc.diagnosis.spread import spread_of
+from spherloc.diagnosis.spread import spread_in
 from spherloc.free_gravity import MAX_NFA, MIN_LEAD, count_distinct, expected_by_chance, lead, nearby_support
 from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
@@ -101,7 +101,7 @@ def _judge(trace: Trace) -> Judgement:
         _alternative_margin(trace, aligned, state, errors, size, rate, fixed_by),
         _gravity_margin(aligned, state, errors, inliers, trace.options),
         _error_margin(trace, aligned, state, inliers),
-        _spread_margin(trace, aligned, inliers),
+        _spread_margin(trace, inliers),
     ]
     score = min(margin for margin, _ in found)
     reasons = tuple(reason for margin, reason in found if margin < 0.0)
@@ -171,7 +171,7 @@ def _error_margin(trace: Trace, aligned: AlignedProblem, state: FloatArray, inli
     return -np.log(worst), f"Its inliers fix it to no better than {fixed} (1 sd)."
 
 
-def _spread_margin(trace: Trace, aligned: AlignedProblem, inliers: BoolArray) -> tuple[float, str]:
+def _spread_margin(trace: Trace, inliers: BoolArray) -> tuple[float, str]:
     """Margin against an object or a facade that looks alike elsewhere."""
-    spread = spread_of(trace.problem.camera, aligned.bearings, inliers)
+    spread = spread_in(trace.problem, inliers)
     return (np.inf, "") if spread is None else (spread.margin, spread.sentence)

@@ -1,6 +1,7 @@
 """Matches that agree on one thing in the view alone: an object that looks alike elsewhere fixes a wrong pose well."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,7 +72,9 @@ def test_a_pose_on_one_thing_in_the_view_is_doubtful(scene_of):
     corner = bearings @ bearings[np.flatnonzero(right)[0]] > np.cos(np.radians(45.0))
     kept = np.flatnonzero(~right | corner)
     part = replace(problem, pixels=problem.pixels[kept], points=problem.points[kept])
-    trace = estimate(part, "mc", seed=0)
+    assert judge(estimate(part, "mc", seed=0)).outcome is Outcome.LOCALIZED, "wrong matches of a simulation say nothing"
+    matched = replace(part, reference_images=(Path("a.png"),), reference_index=np.zeros(len(kept), np.int64))
+    trace = estimate(matched, "mc", seed=0)
     judgement = judge(trace)
     assert np.count_nonzero(trace.inlier_mask) > 15 and judgement.outcome is Outcome.DOUBTFUL
     assert any("within" in reason and "of one direction" in reason for reason in judgement.reasons)

@@ -11,7 +11,7 @@ from spherloc.bounds import Bounds, bounds_of
 from spherloc.consensus.chance import chance_rate, nfa
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.causes import Measures
-from spherloc.diagnosis.spread import Spread, spread_of
+from spherloc.diagnosis.spread import Spread, spread_in
 from spherloc.estimators.base import estimate
 from spherloc.estimators.mc_exact import McExactOptions
 from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD, tilt_of
@@ -351,9 +351,7 @@ def gather(trace: Trace) -> Evidence:
         position_sd_m=sd[1],
         reported_sd=None if run is None else sd_of(aligned, run.cam_from_map, agreeing(trace, run.errors_px), options),
         verified_without_point=trace.problem.verified_without_point,
-        spread=None
-        if run is None
-        else spread_of(trace.problem.camera, aligned.bearings, agreeing(trace, run.errors_px)),
+        spread=None if run is None else spread_in(trace.problem, agreeing(trace, run.errors_px)),
     )
 
 

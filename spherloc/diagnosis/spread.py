@@ -13,6 +13,7 @@ import numpy as np
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.problem import Problem
 from spherloc.types import BoolArray, FloatArray
 
 WITHIN = 0.9
@@ -63,6 +64,12 @@ class Spread:
             f"Nearly all matches that agree lie within {self.radius_deg:.0f}° of one direction; elsewhere "
             f"{self.agreeing_rest} of {self.rest} do: something that looks alike may stand there."
         )
+
+
+def spread_in(problem: Problem, agreeing: BoolArray) -> Spread | None:
+    """``spread_of`` the ``agreeing`` (M,) usable correspondences of a problem whose matches are with images; None for
+    others, as wrong matches of a simulation are wherever it puts them."""
+    return spread_of(problem.camera, problem.aligned.bearings, agreeing) if problem.reference_images else None
 
 
 def spread_of(camera: Camera, bearings: FloatArray, agreeing: BoolArray) -> Spread | None:

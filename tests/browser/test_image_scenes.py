@@ -241,7 +241,7 @@ def test_a_folder_of_photographs_becomes_a_map_and_opens(
     tab.touch("map-folder:0:square").click()
     expect(tab.page.get_by_text(re.compile(r"^square: \d of \d (images|pairs of images) "))).to_be_visible()
     expect(stop).to_be_visible()
-    expect(tab.page.get_by_text(re.compile(r"^in the map +3 of 3 images, "))).to_be_visible()
+    expect(tab.page.get_by_role("cell", name=re.compile(r"^3 of 3 images, "))).to_be_visible()
     expect(stop).to_have_count(0)
 
     scene = load_scene(folder.with_name("square_map") / "scene.toml")
