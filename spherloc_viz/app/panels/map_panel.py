@@ -85,7 +85,7 @@ def _table(lines: Sequence[str]) -> str:
     rows = []
     for line in lines:
         name, told, rest = line.partition("  ")
-        cells = f"<td style='padding-right:8px'>{escape(name)}</td><td>{escape(rest.strip())}</td>"
+        cells = f"<td style='padding-right:8px;white-space:nowrap'>{escape(name)}</td><td>{escape(rest.strip())}</td>"
         rows.append(f"<tr style='vertical-align:top'>{cells if told else f'<td colspan=2>{escape(line)}</td>'}</tr>")
     return f"<table>{''.join(rows)}</table>"
 
