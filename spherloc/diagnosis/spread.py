@@ -25,6 +25,8 @@ MIN_REST = 40
 MAX_RATIO = 0.15
 """``Spread.ratio`` below which hardly any match agrees in the rest of the view."""
 MIN_AGREEING = 4
+ROUNDING = 1e-12
+"""Of a cosine: equal bearings are inside though their products are rounded in another way."""
 MAX_CENTRES = 200
 """Largest number of directions that are tried as the middle of the part."""
 
@@ -81,7 +83,7 @@ def spread_of(camera: Camera, bearings: FloatArray, agreeing: BoolArray) -> Spre
     centres = chosen[:: -(-len(chosen) // MAX_CENTRES)]
     cosines = np.quantile(centres @ chosen.T, 1.0 - WITHIN, axis=1, method="lower")
     best = int(cosines.argmax())
-    inside = bearings @ centres[best] >= cosines[best]
+    inside = bearings @ centres[best] >= cosines[best] - ROUNDING
     return Spread(
         radius_deg=float(np.degrees(np.arccos(np.clip(cosines[best], -1.0, 1.0)))),
         inside=int(inside.sum()),
