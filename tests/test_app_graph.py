@@ -15,6 +15,7 @@ from spherloc.estimators import estimate
 from spherloc.trace import ConsensusStage, Trace, TranslationStage
 from spherloc_viz import style
 from spherloc_viz.app.plots.graph_view import MAX_EDGES, cell_nodes, edges_of, graph_html, graph_note, matrix_png
+from spherloc_viz.app.plots.ball_list import ball_list_html, selected_rows
 from spherloc_viz.layers import graph_begins, paint, steps
 from spherloc_viz.layers.primitives import Graph
 from spherloc_viz.layers.translation import MAX_NODES, BallSet, ball_nodes, graph_at
@@ -153,3 +154,29 @@ def test_the_note_is_true_of_one_node_and_of_few(mc: Trace) -> None:
     stage = mc.stage(TranslationStage)
     assert stage is not None
     assert f"of {len(np.unique(stage.pairs[stage.clique]))} matches. The Matches tab lists" in notes["clique"]
+
+
+def test_all_balls_are_listed_with_the_clique_first(mc: Trace) -> None:
+    stage, found = mc.stage(TranslationStage), graphs(mc)
+    assert stage is not None
+    listed = {key: graph.list_balls() for key, graph in found.items() if graph.list_balls is not None}
+    assert listed.keys() == found.keys()
+    rows, size = listed["clique"], len(stage.clique)
+    pairs = [tuple(pair) for pair in stage.pairs.tolist()]
+    order = [pairs.index(tuple(pair)) for pair in rows.pairs.tolist()]
+    assert sorted(order) == list(range(len(stage.radii_m))) and rows.marked == size
+    assert set(order[:size]) == set(stage.clique.tolist())
+    for part in (order[:size], order[size:]):
+        assert (np.diff(stage.radii_m[part]) >= 0.0).all()
+    assert rows.overlaps.tolist() == np.bincount(stage.edges.ravel(), minlength=len(order))[order].tolist()
+    for key, graph in found.items():
+        assert len(listed[key].pairs) == graph.count and listed[key].overlaps.sum() == 2 * edges_of(graph).total, key
+
+    kept = np.arange(len(mc.problem)) + 1000
+    lit = selected_rows(rows, tuple(rows.pairs[3].tolist()))
+    html = ball_list_html(rows, 0, lit, kept, style.CLIQUE, "in the maximum clique")
+    a, b = (rows.pairs[3] + 1000).tolist()
+    assert f'data-touch="select:{a},{b}"' in html and html.count("data-reveal") == 1 and f"ball-{a}-{b}" in html
+    assert html.count(">yes<") == min(size, 25) and ElementTree.fromstring(f"<div>{html}</div>").tag == "div"
+    often = int(rows.pairs[3, 0])
+    assert len(selected_rows(rows, (often,))) == np.count_nonzero(stage.pairs == often)

@@ -60,7 +60,7 @@ def test_what_is_written_is_read_again(place: Place) -> None:
     viewpoint = (1.5, -2.25, 3.0, 0.0, 0.125, -1e-05, 45.0)
     request = RunRequest(scene, "ransac-2p", options)
     view = PageView("sample-3", (2, 4), "light", True, viewpoint, "Graph", compared=("mc", "ransac-2p"))
-    view = replace(view, table=TableLook("outliers", "px", down=True))
+    view = replace(view, table=TableLook("outliers", "px", down=True), graph="list")
     found = place.follower.follow(place.link(request, view), place.now, VIEW)
     assert (found.request, found.view, found.remarks) == (request, view, ())
     assert place.follower.follow("", place.now, VIEW).remarks == ()

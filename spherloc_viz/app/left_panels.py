@@ -63,7 +63,7 @@ class LeftPanels:
         with _view(gui, views, "Yaw"):
             self._yaw = YawView(gui, touches, changed)
         with _view(gui, views, "Graph"):
-            self._graph = GraphView(gui, touches, select)
+            self.graph = GraphView(gui, touches, changed, select)
         with _view(gui, views, "Charts"):
             gui.add_html(heading_html("Curves of the step at hand", "step"))
             self._charts = ChartPanel(gui)
@@ -104,7 +104,7 @@ class LeftPanels:
             chart = next((chart for chart in of_yaw if chart.name == "yaw"), None)
             self._yaw.draw(run.trace, picture.step.key, selected, kept, hidden, chart)
         if "Graph" in seen:
-            self._graph.draw(picture.graph, graph_begins(run.trace), selected, kept)
+            self.graph.draw(picture.graph, graph_begins(run.trace), selected, kept)
         if "Charts" in seen:
             self._charts.draw(picture.charts)
         if "Residuals" in seen:

@@ -22,6 +22,7 @@ from spherloc.problem import Problem
 from spherloc_viz.app.catalog import Catalog, Run, RunRequest, SceneRequest
 from spherloc_viz.app.matches.match_table import NEW_TABLE, TableLook, look_of
 from spherloc_viz.app.panels.folders import Roots
+from spherloc_viz.app.plots.graph_view import LOOKS
 from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.options import option_fields, typed, usable_estimators
 
@@ -41,7 +42,7 @@ LISTS = ("spoil", "mend", "hide")
 """Keys of ``EDITS``, in their order."""
 ONCE = (
     *("v", "run", "scene", "case", "place", "seed", "query", "camera", *LISTS, "estimator"),
-    *("step", "select", "view", "theme", "answers", "tab", "compare", "table"),
+    *("step", "select", "view", "theme", "answers", "tab", "compare", "table", "graph"),
 )
 MANY = ("set", "option")
 
@@ -63,6 +64,8 @@ class PageView:
     """Names of the estimators that are compared on the run's problem."""
     table: TableLook = NEW_TABLE
     """Filter and order of the table of matches."""
+    graph: str = LOOKS[0]
+    """Look of the graph of balls."""
 
 
 def link_of(
@@ -99,6 +102,7 @@ def link_of(
         ("answers", ANSWERS[1] if view.answers_hidden else None),
         ("compare", ",".join(view.compared)),
         ("table", view.table.text()),
+        ("graph", view.graph if view.graph != LOOKS[0] else None),
     ]
     text = urlencode([(key, value) for key, value in pairs if value])
     return text if len(text) <= MAX_LETTERS else ""
@@ -305,8 +309,9 @@ def _view(said: dict[str, Any], view: PageView, opened: Opened | None, remarks: 
         table = look_of(said.get("table", ""))
     except InputError as error:
         remarks.append(str(error))
+    graph = _one_of(said, "graph", LOOKS, remarks)
     compared = _compared(said.get("compare", ""), remarks)
-    return PageView(step, selected, theme, hidden, viewpoint, tab, compared, table)
+    return PageView(step, selected, theme, hidden, viewpoint, tab, compared, table, graph)
 
 
 def _compared(text: str, remarks: list[str]) -> tuple[str, ...]:

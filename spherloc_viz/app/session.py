@@ -316,6 +316,7 @@ class Session:
             remarks += followed.missing(key, kept)
             self._display.panels.steps.go(key)
             self._display.panels.matches.look = followed.view.table
+            self._display.panels.graph.look = followed.view.graph
             compared = followed.view.compared
             self._display.panels.open_tab(followed.view.tab, COMPARE if compared else "")
             self._controls.compare.follow(self._run.trace, compared)
@@ -337,6 +338,7 @@ class Session:
             self._display.panels.tab,
             () if run is None else self._controls.compare.compared(run.trace),
             replace(self._display.panels.matches.look, page=0),
+            self._display.panels.graph.look,
         )
 
     def _open_linked(self, file: str) -> Opened:

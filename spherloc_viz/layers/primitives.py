@@ -198,6 +198,21 @@ class Nodes:
 
 
 @dataclass(frozen=True, eq=False)
+class BallRows:
+    """All balls that the steps so far have added, T of them, drawn in the graph or not: those that the step is about
+    first, and the small ones of both first."""
+
+    pairs: NDArray[np.int64]
+    """(T, 2) the correspondences of each ball."""
+    radii: tuple[str, ...]
+    """Radius of each ball, as text with its unit."""
+    overlaps: NDArray[np.int64]
+    """(T,) number of others among these that each ball overlaps."""
+    marked: int
+    """Number of balls that the step is about, which come first."""
+
+
+@dataclass(frozen=True, eq=False)
 class Graph:
     """The graph as a step shows it."""
 
@@ -212,6 +227,8 @@ class Graph:
     """Colour of the marked nodes."""
     words: str
     """A sentence that says what is marked."""
+    list_balls: Callable[[], BallRows] | None = None
+    """Lists the balls, if the nodes are balls."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Translation: the balls of feasible camera positions gather, their overlaps, and their maximum clique."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from math import gcd
 
@@ -14,7 +14,7 @@ from spherloc.types import BoolArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers.agreement import agreement
 from spherloc_viz.layers.frame import Frame, Plan, RunView, ball_boxes, even, growing, level_circles, one_color
-from spherloc_viz.layers.primitives import Balls, Focus, Graph, Label, Nodes, Points, SceneItem, Segments
+from spherloc_viz.layers.primitives import BallRows, Balls, Focus, Graph, Label, Nodes, Points, SceneItem, Segments
 from spherloc_viz.layers.ring import GOLDEN
 
 OPACITIES = ((4, 0.3), (np.inf, 0.2))
@@ -213,6 +213,19 @@ def ball_nodes(balls: BallSet) -> Nodes:
     )
 
 
+def ball_rows(view: RunView, balls: BallSet, shown: IntArray | None, marked: IntArray) -> BallRows:
+    """The balls of a step in rows: some by their indices in the stage, or all (None); and the marked ones."""
+    stage, there, about = balls.stage, balls.by_radius, balls.mask(marked)
+    if shown is not None:
+        there = there[balls.mask(shown)[there]]
+    about &= balls.mask(there)
+    rows = np.concatenate([there[about[there]], there[~about[there]]])
+    edges = stage.edges if shown is None else balls.edges_within(balls.mask(shown))
+    overlaps = np.bincount(edges.ravel(), minlength=len(balls))[rows]
+    radii = tuple(view.length(float(radius_m)) for radius_m in stage.radii_m[rows])
+    return BallRows(stage.pairs[rows].astype(np.int64), radii, overlaps, int(np.count_nonzero(about)))
+
+
 def match_nodes(view: RunView, stage: ConsensusStage) -> Nodes:
     """Nodes are matches, and those agree that have an arc over the stage's yaw."""
     aligned = view.trace.problem.aligned
@@ -293,7 +306,8 @@ def plans(view: RunView, stage: TranslationStage) -> list[Plan]:
     nodes = cache(partial(ball_nodes, balls))
 
     def graph(shown: IntArray | None, marked: IntArray, words: str, color: style.RGB = style.CLIQUE) -> Graph:
-        return graph_at(nodes, shown, marked, color, words)
+        listed = partial(ball_rows, view, balls, shown, marked)
+        return replace(graph_at(nodes, shown, marked, color, words), list_balls=listed)
 
     one = np.array([balls.example])
     out = [

@@ -14,7 +14,7 @@ from spherloc.trace import Trace
 from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.app.matches.image_panel import jpeg_uri
-from spherloc_viz.app.matches.match_table import chip
+from spherloc_viz.app.paging import chip
 from spherloc_viz.app.text import DIM, box, table_html
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers.explanation import Explanation, Pairs, explain

@@ -13,7 +13,8 @@ from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.types import BoolArray, IntArray
 from spherloc_viz import style
-from spherloc_viz.app.text import DIM, WITHHELD, box, status_html
+from spherloc_viz.app.paging import PAGE, chip, page_of, pages_html
+from spherloc_viz.app.text import WITHHELD, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers.matches import (
@@ -28,16 +29,6 @@ from spherloc_viz.layers.matches import (
 )
 
 MAX_REFERENCES = 8
-
-
-def chip(words: str, touch: str, on: bool, hint: str = "") -> str:
-    """A button; ``on`` highlights the one that is active."""
-    look = "background:rgba(80,130,220,.28)" if on else "background:rgba(128,136,150,.16)"
-    title = f' title="{escape(hint)}"' if hint else ""
-    return (
-        f'<span role="button" tabindex="0" data-touch="{escape(touch)}"{title} style="display:inline-block;'
-        f'margin:0 .35em .35em 0;padding:.12em .6em;border-radius:1em;{look}">{escape(words)}</span>'
-    )
 
 
 def chips_html(problem: Problem, inlier_mask: BoolArray, shown: int | None) -> str:
@@ -62,7 +53,6 @@ def chips_html(problem: Problem, inlier_mask: BoolArray, shown: int | None) -> s
     return box(f'<div style="opacity:.65;padding-bottom:.2em">{note}</div>{chips}', "font-size:12px")
 
 
-PAGE = 25
 COLUMNS = (
     ("number", "match", "Its number"),
     ("run", "run", "Whether the run calls it an inlier"),
@@ -144,7 +134,7 @@ class MatchTablePanel:
         page = min(look.page, pages - 1)
         if selected != self._followed:
             self._followed = selected
-            page = _page_of(listed, selected, page)
+            page = page_of(np.flatnonzero(np.isin(listed, selected)), page)
         self.look = look = replace(look, page=page)
         self._drawn = (*drawn[:3], look)
         html = table_html(rows, listed, look, frozenset(selected), kept)
@@ -166,14 +156,6 @@ class MatchTablePanel:
     def _show(self, look: TableLook) -> None:
         self.look = look
         self._changed(look)
-
-
-def _page_of(listed: IntArray, selected: tuple[int, ...], page: int) -> int:
-    """The current page if it holds one of the selected matches, else the page of the first of them that is listed."""
-    places = np.flatnonzero(np.isin(listed, selected))
-    if not len(places) or (places // PAGE == page).any():
-        return page
-    return int(places[0]) // PAGE
 
 
 def table_html(rows: MatchColumns, listed: IntArray, look: TableLook, selected: frozenset[int], kept: NDArray) -> str:
@@ -237,11 +219,6 @@ def _number(value: float) -> str:
 
 
 def _pages(rows: MatchColumns, listed: IntArray, look: TableLook) -> str:
-    first, last = look.page * PAGE + 1, min((look.page + 1) * PAGE, len(listed))
-    some = f"{first}–{last} of {len(listed):,}" if len(listed) else "none"
-    back = chip("‹", f"match-page:{look.page - 1}", False, "Previous page") if look.page > 0 else ""
-    on = chip("›", f"match-page:{look.page + 1}", False, "Next page") if last < len(listed) else ""
     inliers = np.count_nonzero(rows.kept)
     asked = f"; agrees: of {'an even sample of ' if rows.partners < inliers else ''}{rows.partners} inliers"
-    note = f'<span style="{DIM}">{some}{asked if rows.partners else ""}</span>'
-    return f'<div style="padding-top:.4em">{back}{on}{note}</div>'
+    return pages_html(look.page, len(listed), "match-page", asked if rows.partners else "")

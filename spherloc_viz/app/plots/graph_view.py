@@ -12,15 +12,20 @@ from numpy.typing import NDArray
 
 from spherloc_viz import style
 from spherloc_viz.app.glossary import help_html, linked
+from spherloc_viz.app.paging import PAGE, chip, page_of
 from spherloc_viz.app.plots import shapes
+from spherloc_viz.app.plots.ball_list import PAGES, ball_list_html, selected_rows
 from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers.frame import even
 from spherloc_viz.layers.matches import IN_CLIQUE
-from spherloc_viz.layers.primitives import Graph
+from spherloc_viz.layers.primitives import BallRows, Graph
 
-CELL = "graph-cell"
+CELL, LOOK = "graph-cell", "graph-look"
+LIST = "list"
+LOOKS = ("drawing", LIST)
+"""Looks of the panel where nodes are balls."""
 WIDTH_PX, HEIGHT_PX = 400.0, 208.0
 MIDDLE_PX, RADIUS_PX = (98.0, 110.0), 93.0
 MATRIX_PX = (212.0, 20.0, 186.0)
@@ -221,15 +226,21 @@ NEVER = (
 
 
 class GraphView:
-    """The panel with graph and matrix. Pressing a node, or a cell of the matrix, selects its matches."""
+    """The panel with graph and matrix, or in their place a list of the balls. Pressing a node, a cell of the matrix or
+    a row selects its matches."""
 
-    def __init__(self, gui: viser.GuiApi, touches: Touches, select: Select) -> None:
-        """``select`` is called with matches by their numbers in the problem."""
-        self._select = select
+    def __init__(self, gui: viser.GuiApi, touches: Touches, changed: Callable[[object], None], select: Select) -> None:
+        """``changed`` has the page drawn anew; ``select`` is called with matches by their numbers in the problem."""
+        self._changed, self._select = changed, select
         self._html = gui.add_html("")
-        self._drawn: tuple[Graph | None, str, tuple[int, ...], bytes] | None = None
+        self._drawn: tuple | None = None
         self._graph: Graph | None = None
+        self.look = LOOKS[0]
+        """Which of the looks is shown where nodes are balls."""
+        self._page, self._followed = 0, ()
         touches.on(CELL, self._press)
+        touches.on(LOOK, self._choose)
+        touches.on(PAGES, self._turn)
 
     def draw(self, graph: Graph | None, begins: str, selected: tuple[int, ...], kept: NDArray[np.int64]) -> None:
         """Show the graph as far as it is known at this step; before the step with the key ``begins``, a link to that
@@ -238,12 +249,39 @@ class GraphView:
         ``selected`` are indices in the problem, ``kept`` (N,) the numbers of the matches on the page. Sends nothing if
         nothing changed.
         """
-        drawn = (graph, begins, selected, kept.tobytes())
+        drawn = (graph, begins, selected, kept.tobytes(), self.look, self._page)
         if self._drawn is not None and self._drawn[0] is graph and self._drawn[1:] == drawn[1:]:
             return
-        self._drawn, self._graph = drawn, graph
-        content = _waiting_html(begins) if graph is None else graph_html(graph, selected, kept)
+        self._graph = graph
+        if graph is None:
+            content = _waiting_html(begins)
+        elif graph.list_balls is not None and self.look == LIST:
+            content = self._list_html(graph, graph.list_balls(), selected, kept)
+        else:
+            content = graph_html(graph, selected, kept)
+        self._drawn = (*drawn[:-1], self._page)
         update_widget(self._html, content=content)
+
+    def _list_html(self, graph: Graph, rows: BallRows, selected: tuple[int, ...], kept: NDArray[np.int64]) -> str:
+        """The list; if a ball was just selected elsewhere, it turns to its page."""
+        lit = selected_rows(rows, selected)
+        self._page = min(self._page, (len(rows.radii) - 1) // PAGE)
+        if selected != self._followed:
+            self._followed = selected
+            self._page = page_of(lit, self._page)
+        marks = "in the maximum clique" if graph.color == style.CLIQUE else "in this step's set"
+        words = f'<div style="padding-bottom:.2em">{linked(graph.words)}</div>'
+        return box(_title(graph, LIST) + words + ball_list_html(rows, self._page, lit, kept, graph.color, marks))
+
+    def _choose(self, touch: Touch) -> None:
+        if touch.argument in LOOKS:
+            self.look = touch.argument
+            self._changed(None)
+
+    def _turn(self, touch: Touch) -> None:
+        if touch.argument.isdecimal():
+            self._page = min(int(touch.argument), 10**6)
+            self._changed(None)
 
     def _press(self, touch: Touch) -> None:
         graph = self._graph
@@ -256,14 +294,22 @@ class GraphView:
 def graph_html(graph: Graph, selected: tuple[int, ...], kept: NDArray[np.int64]) -> str:
     """Both drawings, with a description of what they show."""
     lit, edges = graph.nodes.lit(selected), edges_of(graph)
-    title = f'<div style="font-weight:600;padding-bottom:.3em">Graph and matrix{help_html("graph")}</div>'
     lit = lit[graph.shown[lit]]
     chosen = chosen_words(graph, lit, kept)
     words = "".join(
         f'<div style="padding-top:.4em">{said}</div>' for said in (linked(graph.words), escape(chosen)) if said
     )
     note = f'<div style="font-size:12px;opacity:.75;padding-top:.3em">{escape(graph_note(graph, edges))}</div>'
-    return box(title + graph_svg(graph, edges, lit, kept) + words + note)
+    return box(_title(graph, LOOKS[0]) + graph_svg(graph, edges, lit, kept) + words + note)
+
+
+def _title(graph: Graph, look: str) -> str:
+    """The heading; where nodes are balls, with buttons for the looks."""
+    title = f'<div style="font-weight:600;padding-bottom:.3em">Graph and matrix{help_html("graph")}</div>'
+    if graph.list_balls is None:
+        return title
+    names = ("drawing", f"list of {graph.count:,} {'ball' if graph.count == 1 else 'balls'}")
+    return title + "".join(chip(name, f"{LOOK}:{one}", one == look) for one, name in zip(LOOKS, names, strict=True))
 
 
 def _waiting_html(begins: str) -> str:
