@@ -124,7 +124,7 @@ def tracking(folder: Path) -> str:
         Solving(estimator, settings, folder / "tracking" / f"{number}", None, first)
         for number, (estimator, settings, first) in enumerate(TRACKING.values())
     ]
-    results, _ = localized(scene, solvings, 0, (), False)
+    results = localized(scene, solvings, 0, (), False).results
     lines = [
         TRACKS,
         "| system | localized | initialised | success (0.25 m 2° / 0.5 m 5° / 1 m 8°) | estimating, all (ms) |",

@@ -17,7 +17,7 @@ from spherloc.errors import InputError
 from spherloc.experiments.sweep_rows import SweepRow, point_of
 from spherloc_viz.commands.sweep import parse_entrant, sweep, sweep_two
 from spherloc_viz.layers.sweep import LIMIT, sweep_charts, sweep_colors, sweep_table
-from spherloc_viz.plots import sweep_png
+from spherloc_viz.plots.sweeps import sweep_png
 from tests.tiny_scene import write_tiny_scene
 from tests.waiting import LIMIT_S
 

@@ -1,7 +1,7 @@
 """``spherloc localize``: sequences of queries against a map, resumable, and tables and pictures that compare them."""
 
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -51,6 +51,7 @@ from spherloc_viz.options import json_text
 from spherloc_viz.recording.origin import Origin
 
 if TYPE_CHECKING:
+    from spherloc_viz.plots.trajectories import Backdrop
     from spherloc_viz.recording.storage.store import RecordingStore
 
 MAX_TOLD, MAX_EACH = 5, 20
@@ -86,10 +87,10 @@ def localize_sequence(
     0 if every chosen query is localized by each, 1 if one is doubtful or has no pose. Raises ``InputError`` for
     whatever makes all of it impossible.
     """
-    results, chosen = localized(path, solvings, seed, queries, retry_failed)
-    for found in results:
+    done = localized(path, solvings, seed, queries, retry_failed)
+    for found in done.results:
         print(_text(found, summarize(found)), flush=True)
-    return _code(results, chosen)
+    return _code(done)
 
 
 def compare_sequences(
@@ -97,24 +98,40 @@ def compare_sequences(
 ) -> int:
     """Localize several sequences, each by the ``solvings`` of its path, and put them into one table, written to
     ``output``; returns the exit code of ``localize_sequence``. Raises ``InputError`` as that does."""
-    from spherloc_viz.commands.localize import compared, write_comparison
-
     code, found = 0, []
     for path, several in solvings.items():
-        results, chosen = localized(path, several, seed, queries, retry_failed)
-        found += [compared(solving.label, item) for solving, item in zip(several, results, strict=True)]
-        code = max(code, _code(results, chosen))
+        done = localized(path, several, seed, queries, retry_failed)
+        labels = [solving.label for solving in several]
+        found += [
+            Compared(label, item, summarize(item), done.backdrop)
+            for label, item in zip(labels, done.results, strict=True)
+        ]
+        code = max(code, _code(done))
     print(write_comparison(output, found), flush=True)
     return code
 
 
+@dataclass(frozen=True, eq=False)
+class Localized:
+    """A sequence that several estimators localized."""
+
+    results: list[SequenceResults]
+    """One for each estimator."""
+    chosen: set[str]
+    """Names of the chosen queries."""
+    backdrop: "Backdrop"
+    """What pictures show of the map."""
+
+
 def localized(
     path: Path, solvings: Sequence[Solving], seed: int, queries: Sequence[str], retry_failed: bool
-) -> tuple[list[SequenceResults], set[str]]:
-    """The results of a sequence by each of the estimators, each query matched once for all; and the chosen queries.
+) -> Localized:
+    """The results of a sequence by each of the estimators; each query is matched once for all.
 
     Raises ``InputError`` as ``localize_sequence`` does.
     """
+    from spherloc_viz.plots.trajectories import backdrop_of
+
     scene = load_scene(path)
     if not isinstance(scene, MapScene):
         raise InputError(f"{path}: is one problem, no sequence of query images; solve it by: spherloc run {path}")
@@ -143,13 +160,14 @@ def localized(
             ]
             _work(scene, wanted, logs, hows, recorders)
         results = [log.results() for log in logs]
+        backdrop = backdrop_of(scene)
         for log, found in zip(logs, results, strict=True):
-            _finish(log, found, scene)
-    return results, {view.name for view in chosen}
+            _finish(log, found, scene, backdrop)
+    return Localized(results, {view.name for view in chosen}, backdrop)
 
 
-def _code(results: Sequence[SequenceResults], chosen: Collection[str]) -> int:
-    rows = [row for found in results for row in found.rows if row.query in chosen]
+def _code(done: Localized) -> int:
+    rows = [row for found in done.results for row in found.rows if row.query in done.chosen]
     return 0 if all(row.status == LOCALIZED for row in rows) else 1
 
 
@@ -240,9 +258,9 @@ class _Recorder:
             return str(path.resolve())
 
 
-def _finish(log: ResultsLog, results: SequenceResults, scene: MapScene) -> None:
+def _finish(log: ResultsLog, results: SequenceResults, scene: MapScene, backdrop: "Backdrop") -> None:
     """Write trajectories, picture and summary of all results so far."""
-    from spherloc_viz.plots import trajectory_png
+    from spherloc_viz.plots.trajectories import trajectory_png
 
     truth = true_trajectory(results)
     write_tum(log.folder / TRAJECTORY, estimated_trajectory(results))
@@ -250,7 +268,7 @@ def _finish(log: ResultsLog, results: SequenceResults, scene: MapScene) -> None:
         write_tum(log.folder / TRUE_TRAJECTORY, truth)
     if scene.vehicle_from_camera is not None:
         write_tum(log.folder / VEHICLE_TRAJECTORY, vehicle_trajectory(results, scene.vehicle_from_camera))
-    log.write(PICTURE, trajectory_png(results))
+    log.write(PICTURE, trajectory_png(results, backdrop))
     log.write(SUMMARY, (json_text(asdict(summarize(results))) + "\n").encode())
 
 
@@ -395,11 +413,8 @@ class Compared:
     """Results of all finished queries."""
     summary: Summary
     """Summary of these results."""
-
-
-def compared(label: str, results: SequenceResults) -> Compared:
-    """The results with their summary."""
-    return Compared(label, results, summarize(results))
+    backdrop: "Backdrop"
+    """What the picture shows of the sequence's map."""
 
 
 def write_comparison(folder: Path, found: Sequence[Compared]) -> str:
@@ -407,7 +422,7 @@ def write_comparison(folder: Path, found: Sequence[Compared]) -> str:
 
     Raises ``InputError`` if they cannot be written.
     """
-    from spherloc_viz.plots import trajectories_png
+    from spherloc_viz.plots.trajectories import trajectories_png
 
     table = comparison_table(found)
     files = {
@@ -416,8 +431,9 @@ def write_comparison(folder: Path, found: Sequence[Compared]) -> str:
     }
     names = list(dict.fromkeys(item.results.configuration.name for item in found))
     for name in names:
-        of_scene = [(item.label, item.results) for item in found if item.results.configuration.name == name]
-        files[f"{re.sub(r'[^A-Za-z0-9-]+', '_', name).strip('_') or 'scene'}.png"] = trajectories_png(of_scene)
+        of_scene = [item for item in found if item.results.configuration.name == name]
+        picture = trajectories_png([(item.label, item.results) for item in of_scene], of_scene[0].backdrop)
+        files[f"{re.sub(r'[^A-Za-z0-9-]+', '_', name).strip('_') or 'scene'}.png"] = picture
     for name, content in files.items():
         try:
             folder.mkdir(parents=True, exist_ok=True)

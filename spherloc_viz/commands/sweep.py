@@ -65,7 +65,7 @@ def sweep(
             raise
         log.finish()
         points = summarize(plan.labels, log.rows)
-        from spherloc_viz.plots import sweep_png
+        from spherloc_viz.plots.sweeps import sweep_png
 
         log.write(log.beside(PICTURE), sweep_png(load_scene(scene).name, over, plan.labels, points))
         print(text_of(sweep_table(over, points)))

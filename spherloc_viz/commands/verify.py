@@ -210,7 +210,7 @@ def _session(dataset: Dataset, session: DatasetSession, output: Path, quick: boo
         entrant = TABLE_METHODS[name]
         settings = tuple(f"{key}={str(value).lower()}" for key, value in entrant.changes)
         solvings.append(Solving(entrant.estimator, settings, folder / name, None))
-    results, _ = localized(scene, solvings, 0, ("0:10",) if quick else (), False)
+    results = localized(scene, solvings, 0, ("0:10",) if quick else (), False).results
     return [
         SessionResult(dataset.key, session.name, name, summarize(found))
         for name, found in zip(dataset.methods, results, strict=True)

@@ -19,6 +19,8 @@ import pytest
 from sequence_samples import true_pose, write_scene
 
 from spherloc import registry
+from spherloc.datasets import load_scene
+from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import SpherlocError
 from spherloc.experiments import read_results
 from spherloc.mapping.written import MODEL, SCENE
@@ -28,7 +30,7 @@ from spherloc_viz.commands.bundled import all_scenes, one_kind
 from spherloc_viz.commands.localize import Solving, compare_sequences, localize_sequence
 from spherloc_viz.commands.run import Records
 from spherloc_viz.commands.scene_commands import _results_name
-from spherloc_viz.plots import trajectory_png
+from spherloc_viz.plots.trajectories import backdrop_of, trajectory_png
 from spherloc_viz.recording.content.data import read_recording
 from tests.cli_process import spherloc_here
 from tests.waiting import LIMIT_S
@@ -254,7 +256,10 @@ def test_the_picture_shows_truth_errors_and_failures(tmp_path: Path) -> None:
     good = write_scene(tmp_path, queries=4, timed=True)
     assert run(good, tmp_path / "good") == 0
     png = (tmp_path / "good" / "trajectory.png").read_bytes()
-    assert trajectory_png(read_results(tmp_path / "good")) == png
+    scene = load_scene(good)
+    assert isinstance(scene, MapScene)
+    backdrop = backdrop_of(scene)
+    assert trajectory_png(read_results(tmp_path / "good"), backdrop) == png
     assert near(pixels_of(png), TRUTH) > 500 and near(pixels_of(png), OUTLIER) == 0
     (tmp_path / "unordered").mkdir()
     run(write_scene(tmp_path / "unordered", queries=4), tmp_path / "unordered" / "out")
@@ -274,7 +279,7 @@ def test_the_picture_shows_truth_errors_and_failures(tmp_path: Path) -> None:
     told = read_results(tmp_path / "blind" / "out")
     posed = tuple(replace(item, status="localized") for item in told.rows if item.cam_from_map is not None)
     believed, doubted = (
-        near(pixels_of(trajectory_png(replace(told, rows=rows))), OUTLIER)
+        near(pixels_of(trajectory_png(replace(told, rows=rows), backdrop)), OUTLIER)
         for rows in (posed, (*posed[:-1], replace(posed[-1], status="doubtful")))
     )
     assert believed == 0 and doubted > 20, "a pose that is not believed looks like one that is"

@@ -256,7 +256,7 @@ def download_of(plan: SweepPlan, scene: str, rows: tuple[SweepRow, ...], kind: s
     points = summarize(plan.labels, rows)
     if kind == "Summary":
         return f"{stem}.summary.csv", summary_text(plan.over, points).encode()
-    from spherloc_viz.plots import sweep_png
+    from spherloc_viz.plots.sweeps import sweep_png
 
     with _pictures:
         return f"{stem}.png", sweep_png(scene, plan.over, plan.labels, points)

@@ -1,0 +1,76 @@
+"""Names beside places of a picture, none over another or over the edge while there is room."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.transforms import Bbox
+
+from spherloc.errors import shorten
+from spherloc.types import FloatArray
+
+FONT_SIZE = 8
+MAX_LETTERS = 40
+DOT_PX = 8.0
+"""Half the width of the square around each place that names leave free."""
+NEAR, FAR = 7.0, 18.0
+"""Distances of a name from its place, points."""
+_SPOTS = (
+    (NEAR, 0.0), (-NEAR, 0.0), (NEAR, NEAR), (NEAR, -NEAR), (-NEAR, NEAR), (-NEAR, -NEAR), (0.0, NEAR), (0.0, -NEAR),
+    (NEAR, FAR), (NEAR, -FAR), (-NEAR, FAR), (-NEAR, -FAR), (NEAR, 1.6 * FAR), (NEAR, -1.6 * FAR),
+)  # fmt: skip
+"""Where a name is tried, right and up of its place, points."""
+
+
+@dataclass(frozen=True)
+class PlaceName:
+    """A name to be written beside a place."""
+
+    name: str
+    place: FloatArray
+    """(2,) in the coordinates of the axes."""
+    color: str
+
+
+def write_labels(axes: Axes, labels: Sequence[PlaceName], dots: FloatArray) -> None:
+    """Write the labels after all else is drawn; ``dots`` (N, 2) are places that no name should cover."""
+    canvas = axes.figure.canvas
+    assert isinstance(canvas, FigureCanvasAgg)
+    axes.figure.draw_without_rendering()  # fixes where the axes are
+    renderer, edge = canvas.get_renderer(), axes.get_window_extent()
+    centres = axes.transData.transform(np.reshape(dots, (-1, 2)))
+    taken = [np.concatenate([centre - DOT_PX, centre + DOT_PX]) for centre in centres]
+    for label in labels:
+        text = axes.annotate(
+            shorten(label.name, MAX_LETTERS), label.place, xytext=_SPOTS[0], textcoords="offset points",
+            fontsize=FONT_SIZE, color=label.color, parse_math=False, annotation_clip=False,
+        )  # fmt: skip
+        text.set_in_layout(False)
+        tried = []
+        for spot in _SPOTS:
+            _move(text, spot)
+            box = text.get_window_extent(renderer).extents
+            tried.append((_outside(box, edge) + sum(_common(box, other) for other in taken), spot, box))
+        _, spot, box = min(tried, key=lambda one: one[0])
+        _move(text, spot)
+        taken.append(box)
+
+
+def _move(text, spot: tuple[float, float]) -> None:
+    right, up = spot
+    text.set_position(spot)
+    text.set_horizontalalignment("center" if right == 0.0 else "left" if right > 0.0 else "right")
+    text.set_verticalalignment("center" if up == 0.0 else "bottom" if up > 0.0 else "top")
+
+
+def _common(one: FloatArray, other: FloatArray) -> float:
+    """Area that two boxes (left, bottom, right, top) have in common, px^2."""
+    size = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
+    return float(np.prod(np.maximum(size, 0.0)))
+
+
+def _outside(box: FloatArray, edge: Bbox) -> float:
+    """Area of a box beyond the edge, px^2."""
+    return float(np.prod(box[2:] - box[:2])) - _common(box, edge.extents)
