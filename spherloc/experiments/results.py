@@ -19,7 +19,7 @@ from spherloc.datasets.scene_file import numbers
 from spherloc.errors import InputError, reason, show
 from spherloc.experiments.configuration import Configuration, in_short, read_configuration
 from spherloc.files import lock, read_file, reading, write_whole
-from spherloc.geometry import camera_centre
+from spherloc.geometry import align_to_down, camera_centre
 from spherloc.outcome import Outcome
 from spherloc.types import FloatArray
 
@@ -113,8 +113,27 @@ _LATER = {
 }
 """Fields that older files do not have."""
 
-COLUMNS = tuple(name for name in _FIELDS if name not in _POSES)
-"""Columns of the CSV; poses are in the trajectory."""
+PLACE = ("x_m", "y_m", "z_m", "heading_deg")
+"""Columns of the CSV that tell the estimated pose: the camera's position in the map's frame, metres or units of a map
+whose scale is unknown, and ``heading_deg``. Whole poses are in the trajectory."""
+_AFTER = _FIELDS.index("status") + 1
+COLUMNS = tuple(name for name in (*_FIELDS[:_AFTER], *PLACE, *_FIELDS[_AFTER:]) if name not in _POSES)
+"""Columns of the CSV."""
+MIN_LEVEL = math.sin(math.radians(5.0))
+"""Least horizontal part of a camera's axis, a unit vector, that has a heading."""
+
+
+def heading_deg(cam_from_map: FloatArray, gravity_map: FloatArray) -> float | None:
+    """Direction of view of a pose (3, 4), degrees from -180 to 180: of the optical axis, which in a panorama is the
+    middle of the image, seen from above.
+
+    It is counted counter-clockwise from the map's x axis, brought to the horizontal by the smallest rotation that makes
+    the map level; ``gravity_map`` (3,) is the unit vector pointing down. None for a camera that looks up or down.
+    """
+    ahead = align_to_down(gravity_map) @ cam_from_map[2, :3]
+    if math.hypot(ahead[0], ahead[2]) < MIN_LEVEL:
+        return None
+    return math.degrees(math.atan2(ahead[2], ahead[0]))
 
 
 def json_line(row: QueryResult) -> str:
@@ -176,15 +195,27 @@ def _damaged(place: str, what: str) -> InputError:
     return InputError(f"{place}: {what}, so the file is damaged; delete that line to have its query done again.")
 
 
-def csv_text(rows: Iterable[QueryResult], header: bool = True) -> str:
-    """The rows as CSV, a line each: unknown values are empty, and no spreadsheet takes a cell for a formula."""
+def csv_text(rows: Iterable[QueryResult], gravity_map: FloatArray, header: bool = True) -> str:
+    """The rows as CSV, a line each: unknown values are empty, and no spreadsheet takes a cell for a formula.
+
+    ``gravity_map`` (3,) is the unit vector pointing down in the map.
+    """
     file = io.StringIO(newline="")
     writer = csv.writer(file, lineterminator="\n")
     if header:
         writer.writerow(COLUMNS)
     for row in rows:
-        writer.writerow([_cell(getattr(row, name)) for name in COLUMNS])
+        place = _place(row, gravity_map)
+        writer.writerow([_cell(place[name] if name in place else getattr(row, name)) for name in COLUMNS])
     return file.getvalue()
+
+
+def _place(row: QueryResult, gravity_map: FloatArray) -> dict[str, float | None]:
+    """The columns ``PLACE`` of a row."""
+    pose = row.cam_from_map
+    if pose is None:
+        return dict.fromkeys(PLACE)
+    return dict(zip(PLACE, (*camera_centre(pose).tolist(), heading_deg(pose, gravity_map)), strict=True))
 
 
 def _cell(value: Any) -> str:
@@ -337,7 +368,7 @@ class ResultsLog:
             os.fsync(file.fileno())
         self.rows[row.query] = row
         with self._writing(TABLE), (self.folder / TABLE).open("a", encoding="utf-8", newline="") as table:
-            table.write(csv_text([row], header=False))
+            table.write(csv_text([row], self.configuration.gravity_map, header=False))
 
     def forget_failures(self) -> int:
         """Remove the rows of queries without a pose, so that they are done again; returns how many.
@@ -418,4 +449,5 @@ class ResultsLog:
                 self.repaired = True
 
     def _write_table(self) -> None:
-        self.write(TABLE, csv_text(sorted(self.rows.values(), key=lambda row: row.index)).encode())
+        ordered = sorted(self.rows.values(), key=lambda row: row.index)
+        self.write(TABLE, csv_text(ordered, self.configuration.gravity_map).encode())

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from spherloc.errors import InputError
 from spherloc.experiments import QueryResult, read_results
 from spherloc.experiments.configuration import Configuration, read_configuration
-from spherloc.experiments.results import COLUMNS, ResultsLog, csv_text, json_line, row_of_json
+from spherloc.experiments.results import COLUMNS, PLACE, ResultsLog, csv_text, json_line, row_of_json
+from spherloc.geometry import pose
 
 CONFIGURATION = Configuration(
     scene="walk.toml",
@@ -105,10 +106,12 @@ def test_wrong_values_are_refused(change: dict) -> None:
 @settings(max_examples=60)
 @given(st.lists(rows(), max_size=4))
 def test_the_table_is_read_by_others_and_holds_no_formula(written: list[QueryResult]) -> None:
-    found = list(csv.reader(io.StringIO(csv_text(written), newline="")))
+    found = list(csv.reader(io.StringIO(csv_text(written, CONFIGURATION.gravity_map), newline="")))
     assert tuple(found[0]) == COLUMNS and len(found) == len(written) + 1
     for cells, original in zip(found[1:], written, strict=True):
         for name, cell in zip(COLUMNS, cells, strict=True):
+            if name in PLACE:
+                continue
             value = getattr(original, name)
             if isinstance(value, float | int):
                 assert float(cell) == value
@@ -118,7 +121,32 @@ def test_the_table_is_read_by_others_and_holds_no_formula(written: list[QueryRes
                 text = " ".join(value) if isinstance(value, tuple) else value
                 assert cell.lstrip()[:1] not in ("=", "+", "-", "@") and cell.isprintable()
                 assert cell.removeprefix("'") == "".join(c if c.isprintable() else " " for c in text).removeprefix("'")
-    assert len(csv_text(written).splitlines()) == len(written) + 1
+    assert len(csv_text(written, CONFIGURATION.gravity_map).splitlines()) == len(written) + 1
+
+
+def place_of(cam_from_map: np.ndarray | None, down: tuple[float, float, float]) -> list[str]:
+    status = "failed" if cam_from_map is None else "localized"
+    text = csv_text([row(0, status=status, cam_from_map=cam_from_map)], np.array(down))
+    return [next(csv.DictReader(io.StringIO(text)))[name] for name in PLACE]
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 30.0, -120.0, 179.0])
+def test_the_table_tells_where_a_query_is_and_where_it_looks(turned_deg: float) -> None:
+    """In a map whose z axis points up, and in one whose y axis points down."""
+    turned = np.radians(turned_deg)
+    ahead, down = np.array([np.cos(turned), np.sin(turned), 0.0]), np.array([0.0, 0.0, -1.0])
+    standing = np.stack([np.cross(down, ahead), down, ahead])
+    at = pose(standing, -standing @ [1.5, -2.0, 0.25])
+    np.testing.assert_allclose([float(cell) for cell in place_of(at, (0, 0, -1))], [1.5, -2.0, 0.25, turned_deg])
+    of_y_down = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # x, y, z to x, -z, y
+    same = pose(standing @ of_y_down.T, at[:, 3])
+    np.testing.assert_allclose([float(cell) for cell in place_of(same, (0, 1, 0))], [1.5, -0.25, -2.0, turned_deg])
+
+
+def test_a_query_without_a_pose_has_no_place_and_one_that_looks_down_no_heading() -> None:
+    assert place_of(None, (0, 0, -1)) == ["", "", "", ""]
+    down = np.diag([1.0, -1.0, -1.0])
+    assert place_of(pose(down, -down @ [1.0, 2.0, 3.0]), (0, 0, -1)) == ["1.0", "2.0", "3.0", ""]
 
 
 def test_results_are_there_after_every_row_in_the_order_of_the_sequence(tmp_path: Path) -> None:
