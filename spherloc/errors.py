@@ -27,6 +27,10 @@ class InputError(SpherlocError):
     """A file, key or value that the user gave cannot be used."""
 
 
+class StoppedError(InputError):
+    """Work stopped on the way; what is done is kept, and the same command goes on from there."""
+
+
 class CalibrationError(InputError):
     """A camera calibration is unreadable or does not describe a usable camera."""
 

@@ -1,10 +1,11 @@
 """Makes a map from photographs and writes it to the disk: all steps in their order."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from spherloc.errors import InputError, show
+from spherloc.errors import InputError, SpherlocError, StoppedError, show
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
@@ -12,7 +13,7 @@ from spherloc.mapping.carried import carried_nadir_deg
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.photographs import NewImages
 from spherloc.mapping.positions import Positions, gps_of_images
-from spherloc.mapping.reconstruction import Reconstruction, reconstruct
+from spherloc.mapping.reconstruction import DATABASES, Reconstruction, reconstruct
 from spherloc.mapping.upright import (
     Level,
     MapScale,
@@ -24,7 +25,7 @@ from spherloc.mapping.upright import (
     scale_by_height,
     scale_by_positions,
 )
-from spherloc.mapping.written import Kept, Written, write_map
+from spherloc.mapping.written import SCENE, Kept, Written, write_map
 
 GROUP = "group"
 """Name of the folder, with a number, of a map of images that could not be joined with the rest."""
@@ -80,16 +81,55 @@ def make_map(
     For ``new_images``, a scene is written too; ``masks`` are the masks of the views, which are written into the scenes,
     and ``how`` says which features are matched. With ``find_carried``, what moves with the camera below panoramas is
     found and left out, too. Raises ``InputError`` if the images give no map, if ``measured`` names other images, or if
-    a file cannot be read or written.
+    a file cannot be read: then nothing is left in ``folder`` but what was there before. Raises ``StoppedError`` if a
+    file cannot be written: what is done is kept there and not done again.
     """
     names = {view.name for view in views}
     for name in () if measured.distance is None else measured.distance[:2]:
         if name not in names:
             raise InputError(f"{show(name)} is not one of the {len(views)} photographs; give the names of two files.")
+    with _folder_of_map(folder):
+        return _map_in(folder, views, images, measured, new_images, tell, masks, how, find_carried)
+
+
+@contextmanager
+def _folder_of_map(folder: Path) -> Iterator[None]:
+    """Make the folder of a map. Nothing is left of a map that cannot be made; what can go on is kept."""
+    before = set(folder.glob(DATABASES))
+    made = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); give another --output.") from None
+    try:
+        yield
+    except StoppedError:
+        raise
+    except SpherlocError:
+        finished = (folder / SCENE).exists()
+        for path in folder.glob(DATABASES):
+            if path not in before or not finished:
+                path.unlink(missing_ok=True)
+        made = made or bool(before)
+        raise
+    finally:
+        if made:
+            with suppress(OSError):  # it is not empty
+                folder.rmdir()
+
+
+def _map_in(
+    folder: Path,
+    views: Sequence[View],
+    images: Path,
+    measured: ScaleMeasurement,
+    new_images: NewImages | None,
+    tell: Tell,
+    masks: Masks | None,
+    how: FrontendOptions | None,
+    find_carried: bool,
+) -> Map:
+    """``make_map`` in a folder that is there."""
     if measured == ScaleMeasurement():
         measured = ScaleMeasurement(positions=gps_of_images(views))
     carried_deg = carried_nadir_deg(views, tell) if find_carried else 0.0
@@ -108,7 +148,8 @@ def make_map(
         if len(other.poses.keys() - inside) < MIN_OF_GROUP:
             continue
         try:
-            found = _finished(other.without(inside), views, names, gravity, measured, tell)  # others do not grow
+            every = {view.name for view in views}  # others do not grow
+            found = _finished(other.without(inside), views, every, gravity, measured, tell)
         except InputError:  # its images do not agree on where down is
             continue
         if not _worth_a_map(found[0]):

@@ -361,7 +361,7 @@ def two_circles(image: ByteArray) -> bool:
 
 
 def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], None]) -> int:
-    """Write about ``count`` frames of a video into ``folder`` and return their number.
+    """Write about ``count`` frames of a video into ``folder``, which is made, and return their number.
 
     The video is divided into equal pieces, of which the sharpest frame each is written. ``advance`` is called after
     each frame with its file name. Existing frames are not written again. Raises ``InputError`` if the video cannot be
@@ -373,6 +373,10 @@ def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], No
     total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
     if total <= 0:
         raise InputError(f"{video}: OpenCV cannot read it as a video; convert it, to MP4 with H.264 for instance.")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror}); give another folder.") from None
     stretch = max(1, ceil(total / count))
     written = 0
     for number, frame in _sharpest(reader, stretch):
@@ -383,7 +387,7 @@ def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], No
             try:
                 path.write_bytes(content.tobytes() if done else b"")
             except OSError as error:
-                raise InputError(f"{path}: cannot be written ({error.strerror}); give another --output.") from None
+                raise InputError(f"{path}: cannot be written ({error.strerror}); give another folder.") from None
         written += 1
         advance(name)
     return written

@@ -11,6 +11,7 @@ and the map with more images, minus a penalty for contradictions, is taken.
 """
 
 import copy
+import ctypes
 import hashlib
 import json
 import shutil
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_models import colmap_camera
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.errors import InputError, reason
+from spherloc.errors import InputError, StoppedError, reason
 from spherloc.frontend import retrieval
 from spherloc.frontend.features import VERSION, Features, extract
 from spherloc.frontend.pipeline import FrontendOptions
@@ -45,6 +46,8 @@ from spherloc.types import BoolArray, FloatArray
 
 DATABASE_VERSION = 5
 """Number to be increased when pairs are matched or checked in another way, so that old databases are not used."""
+DATABASES = "matches_*.db*"
+"""Pattern of the names of databases, with the files that SQLite puts beside them."""
 MAX_EXHAUSTIVE = 50
 """Largest number of images of which all pairs are tried; of more, each is tried with its neighbours by name and with
 similar images."""
@@ -131,7 +134,7 @@ def reconstruct(
     ``gravity`` is that from the images' vertical lines, ``how`` the features and their matching, SIFT if it is None.
 
     Raises ``InputError`` if pycolmap is missing, if an image or the folder cannot be used, or if no two images fit
-    together.
+    together, and ``StoppedError`` if there is no room for the database.
     """
     pycolmap = require("pycolmap", "colmap", "making a map")
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # errors are reported here instead
@@ -148,12 +151,21 @@ def reconstruct(
     except Exception as error:  # pycolmap passes on whatever SQLite raises
         raise InputError(f"{path}: cannot be written ({reason(error)}); give another --output.") from None
     try:
-        ids = _described(pycolmap, database, views, features, usable)
-        cameras = [view.camera for view in views]
-        compared = ImagePairs(pycolmap, cameras, features, usable, gravity, how.matching)
-        counts, same_place = _matched(database, ids, compared, _pairs(features), tell)
-    finally:
-        database.close()
+        try:
+            ids = _described(pycolmap, database, views, features, usable)
+            cameras = [view.camera for view in views]
+            compared = ImagePairs(pycolmap, cameras, features, usable, gravity, how.matching)
+            counts, same_place = _matched(database, ids, compared, _pairs(features), tell)
+        finally:
+            database.close()
+    except RuntimeError as error:
+        if "SQLite" not in str(error):
+            raise
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(database))  # to delete what cannot be closed aborts the process
+        raise StoppedError(
+            f"{path}: cannot be written ({reason(error)}); make room there and give the same command, which goes on "
+            "with what is done."
+        ) from None
     if counts.max(initial=0) < MIN_MATCHES:
         if same_place.max(initial=0) >= MIN_MATCHES:
             raise InputError(
@@ -347,9 +359,12 @@ def _described(
     features: Sequence[Features],
     usable: Sequence[NDArray[np.int64]],
 ) -> list[int]:
-    """Ids of the images in the database; images that are missing there are added with their features."""
-    if database.num_images():
-        return [database.read_image_with_name(view.name).image_id for view in views]
+    """Ids of the images in the database, which are added with their features if they are not all there."""
+    if database.num_images() == len(views):
+        ids = [database.read_image_with_name(view.name).image_id for view in views]
+        if all(database.exists_keypoints(number) for number in ids):
+            return ids
+    database.clear_all_tables()  # a run that was stopped left them half written
     written: dict[str, tuple[int, int]] = {}
     ids = []
     for view, found, index in zip(views, features, usable, strict=True):

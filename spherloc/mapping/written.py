@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from spherloc.cameras.base import Camera
-from spherloc.errors import InputError
+from spherloc.errors import StoppedError, reason
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
@@ -66,8 +66,8 @@ def write_map(
 ) -> Written:
     """Level and scale a model and write it with its scenes into ``folder``.
 
-    ``images`` is the folder of the views, and ``kept`` the settings for the scene files. Raises ``InputError`` if a
-    file cannot be written.
+    ``images`` is the folder of the views, and ``kept`` the settings for the scene files. Raises ``StoppedError`` if
+    a file cannot be written.
     """
     pycolmap = require("pycolmap", "colmap", "making a map")
     turn = pycolmap.Rotation3d(upright_frame(level))
@@ -94,7 +94,10 @@ def write_map(
             content = _new_scene(folder, images, new_images, views[0].camera, about, level, scale)
             new_scene.write_text(content + _kept(kept, folder), encoding="utf-8")
     except (OSError, RuntimeError) as error:
-        raise InputError(f"{folder}: cannot be written ({error}); give another --output.") from None
+        raise StoppedError(
+            f"{folder}: cannot be written ({reason(error)}); make room there and give the same command, which goes on "
+            "with what is done."
+        ) from None
     return Written(scene, new_scene, poses, made.points(), float(made.model.compute_mean_reprojection_error()))
 
 

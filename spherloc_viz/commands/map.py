@@ -96,12 +96,19 @@ def make(
             for remark in remarks:
                 say(f"{new_images}: {remark}")
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
-        made = make_map(found.views, folder, target, measured, others, tell, masks, how, find_carried=find_carried)
+        try:
+            made = make_map(found.views, folder, target, measured, others, tell, masks, how, find_carried=find_carried)
+        except KeyboardInterrupt:
+            say("stopped; what is done is kept, and the same command goes on from there.")
+            raise
     report = target / REPORT
     try:
         report.write_text(map_report(made, found), encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{report}: cannot be written ({error.strerror}); give another --output.") from None
+        raise InputError(
+            f"{report}: cannot be written ({error.strerror}); the map is done: make room there and give the same "
+            "command for the report."
+        ) from None
     print("\n".join(summary(made, found)))
     print(f"report        {report}")
     if others is not None:
@@ -162,10 +169,6 @@ def about_features(made: Map) -> str:
 
 
 def _take_frames(video: Path, count: int, folder: Path, tell: Tell) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror}); give another folder.") from None
     taken: list[str] = []
 
     def another(name: str) -> None:

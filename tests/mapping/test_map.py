@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from spherloc import registry
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.datasets import bundled_scenes, load_scene
@@ -33,6 +34,7 @@ from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by
 from spherloc.mapping.written import _camera, _queries
 from spherloc.problem import Problem
 from spherloc_viz.commands.map import _kind, _sizes, cameras_of_file, main, map_report, summary
+from tests.waiting import LIMIT_S
 
 IMAGES = ("reference_002", "reference_003", "reference_004", "reference_005", "reference_006")
 
@@ -391,6 +393,68 @@ def test_images_that_show_nothing_together(tmp_path, rng):
         )
     with pytest.raises(InputError, match="no two of the 2 photographs show the same place"):
         make_map(found.views, tmp_path, tmp_path / "map", ScaleMeasurement(), None, lambda *_: None)
+    assert not (tmp_path / "map").exists(), "a map that cannot be made leaves nothing"
+
+
+def test_a_map_that_cannot_be_made_leaves_what_was_there(tmp_path, rng):
+    """A finished map and a file of the user's; but not the matches of an attempt that was stopped."""
+    for name in ("a.png", "b.png"):
+        picture(tmp_path / name, 400, 200, rng)
+    views = photographs(tmp_path, {}).views
+    finished, stopped, own = (tmp_path / name for name in ("finished", "stopped", "own"))
+    for folder, name in ((finished, "scene.toml"), (own, "notes.txt")):
+        folder.mkdir()
+        (folder / name).write_text("kept")
+    (finished / "matches_0.db").write_text("of the finished map")
+    stopped.mkdir()
+    (stopped / "matches_0.db").write_text("half")
+    for folder in (finished, stopped, own):
+        with pytest.raises(InputError, match="no two of the 2 photographs"):
+            make_map(views, tmp_path, folder, ScaleMeasurement(), None, lambda *_: None)
+    assert sorted(path.name for path in finished.iterdir()) == ["matches_0.db", "scene.toml"]
+    assert [path.name for path in own.iterdir()] == ["notes.txt"]
+    assert not stopped.exists()
+
+
+def test_a_stopped_map_goes_on(tmp_path, rng):
+    """Stopped while features are sought, nothing is there yet; afterwards a half written database is no obstacle."""
+    for name in ("a.png", "b.png"):
+        picture(tmp_path / name, 400, 200, rng)
+    views = photographs(tmp_path, {}).views
+
+    def stopped_at(stage):
+        def tell(kind, *_):
+            if kind == stage:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            make_map(views, tmp_path, tmp_path / "map", ScaleMeasurement(), None, tell)
+
+    stopped_at("images searched for features")
+    assert not (tmp_path / "map").exists()
+    stopped_at("pairs of images matched")
+    (path,) = (tmp_path / "map").glob("matches_*.db")
+    pycolmap = registry.require("pycolmap", "colmap", "making a map")
+    with pycolmap.Database.open(str(path)) as database:
+        database.clear_keypoints()
+    with pytest.raises(InputError, match="no two of the 2 photographs"):
+        make_map(views, tmp_path, tmp_path / "map", ScaleMeasurement(), None, lambda *_: None)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit of the size of files")
+def test_a_full_disk_is_told_in_a_sentence_and_what_is_done_is_kept(walk, tmp_path):
+    """In a process of its own, since only that has the limit, and since pycolmap could end it."""
+    limited = (
+        "import resource, sys\nfrom pathlib import Path\nfrom spherloc_viz.commands.map import main\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))\n"
+        "sys.exit(main(Path(sys.argv[1]), Path(sys.argv[2])))"
+    )
+    command = [sys.executable, "-c", limited, str(walk[1].views[0].path.parent), str(tmp_path / "map")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S)
+    assert done.returncode == 1, done.stderr
+    said = json.loads(done.stdout.splitlines()[-1])["error"]
+    assert "cannot be written" in said and "make room there and give the same command" in said
+    assert list((tmp_path / "map").glob("matches_*.db"))
 
 
 def test_frames_of_a_video_are_its_sharpest(tmp_path, rng):
@@ -407,7 +471,8 @@ def test_frames_of_a_video_are_its_sharpest(tmp_path, rng):
     assert names == ["frame_000002.jpg", "frame_000006.jpg", "frame_000010.jpg"]
     (tmp_path / "text.mp4").write_text("no video")
     with pytest.raises(InputError, match="cannot read it as a video"):
-        frames_of(tmp_path / "text.mp4", tmp_path, 3, names.append)
+        frames_of(tmp_path / "text.mp4", tmp_path / "frames", 3, names.append)
+    assert not (tmp_path / "frames").exists()
 
 
 def test_a_lens_that_colmap_lacks_is_fitted():
