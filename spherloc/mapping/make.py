@@ -9,6 +9,7 @@ from spherloc.errors import InputError, SpherlocError, StoppedError, show
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
+from spherloc.mapping.advice import advice
 from spherloc.mapping.carried import carried_nadir_deg
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.photographs import NewImages
@@ -100,7 +101,7 @@ def _folder_of_map(folder: Path) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror}); give another --output.") from None
+        raise InputError(f"{folder}: cannot be made ({error.strerror}); {advice('other folder')}.") from None
     try:
         yield
     except StoppedError:
@@ -159,7 +160,7 @@ def _map_in(
         try:
             place.mkdir(exist_ok=True)
         except OSError as error:
-            raise InputError(f"{place}: cannot be made ({error.strerror}); give another --output.") from None
+            raise InputError(f"{place}: cannot be made ({error.strerror}); {advice('other folder')}.") from None
         groups.append(Map(*found, write_map(*found, views, images, place, new_images, kept)))
     return replace(made, groups=tuple(groups))
 

@@ -18,6 +18,7 @@ from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
 from spherloc.images import check_image, grey, read_image, read_size
+from spherloc.mapping.advice import advice
 from spherloc.mapping.lens import for_colmap
 from spherloc.types import ByteArray
 
@@ -217,8 +218,8 @@ def _of_folder(
         told = ", ".join(f"{len(sizes[size])} of {size[0]} x {size[1]} pixels" for size in order[:MAX_NAMED])
         files = "their calibration" if len(sizes) == 1 else "a file with the calibrations of all of them"
         raise InputError(
-            f"{folder}: its photographs, {told}, are not full panoramas (2 to 1); put {files} beside them, or give it "
-            "with --camera FILE."
+            f"{folder}: its photographs, {told}, are not full panoramas (2 to 1); "
+            f"{advice('calibration').format(files=files)}."
         )
     if rest:
         width, height = next(size for size, names in sizes.items() if rest[0] in names)
@@ -256,8 +257,8 @@ def _with_cameras(
         return found, []
     first, *others = fitting
     taken = f"Camera {shorten(first)} is taken for all images of {size[0]} x {size[1]} pixels"
-    choice = "to choose, name the images or their folder after their camera, or give --camera-name"
-    return dict.fromkeys(names, fitting[first]), [f"{taken}, but {_some(others)} would fit, too; {choice}."]
+    choice = f"but {_some(others)} would fit, too; {advice('which camera')}."
+    return dict.fromkeys(names, fitting[first]), [f"{taken}, {choice}"]
 
 
 def _is_in(camera: str, image: str) -> bool:
@@ -304,7 +305,7 @@ def _about_raw(names: Sequence[str]) -> list[str]:
         return []
     return [
         f"{_were(len(names), 'image')} left out, two fisheye circles side by side and no panorama: {_some(names)}; "
-        "have the camera's own program stitch them, or give --panorama if they are panoramas."
+        f"{advice('two circles')}."
     ]
 
 

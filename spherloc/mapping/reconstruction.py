@@ -36,6 +36,7 @@ from spherloc.frontend.features import VERSION, Features, extract
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import camera_centre
+from spherloc.mapping.advice import advice
 from spherloc.mapping.pairs import MIN_MATCHES, ImagePairs, relative
 from spherloc.mapping.parallel import as_completed
 from spherloc.mapping.rotations import agreeing
@@ -149,7 +150,7 @@ def reconstruct(
     try:
         database = pycolmap.Database.open(str(path))
     except Exception as error:  # pycolmap passes on whatever SQLite raises
-        raise InputError(f"{path}: cannot be written ({reason(error)}); give another --output.") from None
+        raise InputError(f"{path}: cannot be written ({reason(error)}); {advice('other folder')}.") from None
     try:
         try:
             ids = _described(pycolmap, database, views, features, usable)
@@ -162,17 +163,14 @@ def reconstruct(
         if "SQLite" not in str(error):
             raise
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(database))  # to delete what cannot be closed aborts the process
-        raise StoppedError(
-            f"{path}: cannot be written ({reason(error)}); make room there and give the same command, which goes on "
-            "with what is done."
-        ) from None
+        raise StoppedError(f"{path}: cannot be written ({reason(error)}); {advice('go on')}.") from None
     if counts.max(initial=0) < MIN_MATCHES:
         if same_place.max(initial=0) >= MIN_MATCHES:
             raise InputError(
                 f"{np.count_nonzero(np.triu(same_place))} pairs of the {len(views)} photographs match as if all were "
                 "taken from one place. If they were, add photographs from half a metre to two metres away; if not, "
                 "the calibration is wrong, or something moves along and is seen in each, such as a car or a tripod: "
-                "leave it out with --mask or --nadir."
+                f"{advice('moves along')}."
             )
         raise InputError(
             f"no two of the {len(views)} photographs show the same place from two positions: the best pair has "

@@ -12,6 +12,7 @@ from spherloc.errors import InputError, show
 from spherloc.frontend.gravity_from_lines import gravity_from_lines
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN, align_to_down, camera_centre
+from spherloc.mapping.advice import advice
 from spherloc.mapping.parallel import as_completed
 from spherloc.mapping.positions import MAX_SCALE_SD, Positions, overlaid
 from spherloc.types import FloatArray
@@ -150,14 +151,14 @@ def scale_by_height(poses: Mapping[str, FloatArray], points: FloatArray, level: 
     depths = np.sort(below[below > 0.707 * np.linalg.norm(offset, axis=1)])
     if len(depths) < MIN_GROUND_POINTS:
         raise InputError(
-            f"only {len(depths)} points of the map lie below the cameras, too few to find the ground; give a distance "
-            "between two images with --distance instead."
+            f"only {len(depths)} points of the map lie below the cameras, too few to find the ground; give the "
+            "distance of two images instead."
         )
     ground = _deepest_layer(depths)
     if len(ground) < max(MIN_GROUND_POINTS, MIN_GROUND_SHARE * len(depths)):
         raise InputError(
             f"the {len(depths)} points of the map below the cameras lie at all depths, so that the ground cannot be "
-            "told from the rest; give a distance between two images with --distance instead."
+            "told from the rest; give the distance of two images instead."
         )
     height = float(np.median(ground))
     spread = float(np.median(np.abs(ground - height))) / height
@@ -203,7 +204,7 @@ def scale_by_positions(poses: Mapping[str, FloatArray], positions: Positions, le
     if found.scale_sd > MAX_SCALE_SD or 2 * near < len(names):
         raise InputError(
             f"{positions.source} gives no scale: {measured} in the median, so that the scale is uncertain by "
-            f"{found.scale_sd:.0%}; give --distance or --camera-height."
+            f"{found.scale_sd:.0%}; {advice('other scale')}."
         )
     source = f"{positions.source}: {measured} in the median, the scale is good to {max(found.scale_sd, 5e-4):.1%}"
     return MapScale(found.scale, source, off_m=off_m)

@@ -14,6 +14,7 @@ from spherloc.errors import StoppedError, reason
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
+from spherloc.mapping.advice import advice
 from spherloc.mapping.photographs import NewImages, cameras_of
 from spherloc.mapping.reconstruction import Reconstruction
 from spherloc.mapping.upright import Level, MapScale, upright_frame
@@ -94,10 +95,7 @@ def write_map(
             content = _new_scene(folder, images, new_images, views[0].camera, about, level, scale)
             new_scene.write_text(content + _kept(kept, folder), encoding="utf-8")
     except (OSError, RuntimeError) as error:
-        raise StoppedError(
-            f"{folder}: cannot be written ({reason(error)}); make room there and give the same command, which goes on "
-            "with what is done."
-        ) from None
+        raise StoppedError(f"{folder}: cannot be written ({reason(error)}); {advice('go on')}.") from None
     return Written(scene, new_scene, poses, made.points(), float(made.model.compute_mean_reprojection_error()))
 
 

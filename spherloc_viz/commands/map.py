@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.errors import InputError, SpherlocError, show
+from spherloc.errors import InputError, SpherlocError, StoppedError, reason, show
 from spherloc.files import is_image, names_in
 from spherloc.frontend import trained
 from spherloc.frontend.features import FeatureOptions
@@ -37,6 +37,7 @@ from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
 from spherloc.images import read_size
+from spherloc.mapping.advice import advice, for_a_page
 from spherloc.mapping.make import Map, ScaleMeasurement, make_map
 from spherloc.mapping.pairs import MIN_MATCHES
 from spherloc.mapping.photographs import NewImages, Photographs, cameras_of, frames_of, new_images_of, photographs
@@ -105,10 +106,7 @@ def make(
     try:
         report.write_text(map_report(made, found), encoding="utf-8")
     except OSError as error:
-        raise InputError(
-            f"{report}: cannot be written ({error.strerror}); the map is done: make room there and give the same "
-            "command for the report."
-        ) from None
+        raise StoppedError(_unwritten(report, error)) from None
     print("\n".join(summary(made, found)))
     print(f"report        {report}")
     if others is not None:
@@ -118,6 +116,10 @@ def make(
     for group in made.groups if others is not None else ():
         print(f"or there      spherloc localize {group.written.new_scene}")
     return 0 if len(made.written.poses) == len(found.views) else 1
+
+
+def _unwritten(report: Path, error: OSError) -> str:
+    return f"{report}: cannot be written ({reason(error)}); the map is done: {advice('report again')}."
 
 
 def _sizes(images: NewImages) -> str:
@@ -164,8 +166,8 @@ def about_features(made: Map) -> str:
     """A sentence on the features that were used, and on others that could be used."""
     if made.features != "sift":
         return MAP_FEATURES[made.features]
-    there = "" if trained.installed() else ", with the extra 'learned'"
-    return f"SIFT; with ALIKED and LightGlue beside it: --features sift+aliked{there}"
+    more = advice("more features")
+    return f"SIFT{more}" if trained.installed() or not more else f"SIFT{more}, with the extra 'learned'"
 
 
 def _take_frames(video: Path, count: int, folder: Path, tell: Tell) -> None:
@@ -209,7 +211,7 @@ def _kind(views: Sequence[View]) -> str:
 
 
 def _units_unknown(made: Map) -> str:
-    return f"units unknown; {made.scale.why_unknown or '--camera-height, --distance or --positions gives metres'}"
+    return f"units unknown; {made.scale.why_unknown or advice('any scale')}"
 
 
 def summary(made: Map, found: Photographs) -> list[str]:
@@ -243,7 +245,7 @@ def summary(made: Map, found: Photographs) -> list[str]:
 
 def _carried_words(degrees: float) -> str:
     return (
-        f"{degrees:g}° around straight down, where all images show the same: what carries the camera (--nadir 0: not)"
+        f"{degrees:g}° around straight down, where all images show the same: what carries the camera{advice('carried')}"
     )
 
 
@@ -424,17 +426,20 @@ def _data(kind: str, content: bytes) -> str:
 
 def main(folder: Path, output: Path) -> int:
     """Make the map of a folder's photographs for a page that started this process; returns the exit code."""
-    try:
-        found = photographs(folder, {})
-        made = make_map(found.views, folder, output, ScaleMeasurement(), None, _progress)
-        (output / REPORT).write_text(map_report(made, found), encoding="utf-8")
-    except SpherlocError as error:
-        _tell({"error": str(error)})
-        return 1
-    except OSError as error:
-        _tell({"error": f"{output}: cannot be written ({error.strerror})."})
-        return 1
-    _tell({"scene": str(made.written.scene), "summary": [*found.remarks, *summary(made, found)]})
+    report = output / REPORT
+    with for_a_page():
+        try:
+            found = photographs(folder, {})
+            made = make_map(found.views, folder, output, ScaleMeasurement(), None, _progress)
+            report.write_text(map_report(made, found), encoding="utf-8")
+        except SpherlocError as error:
+            _tell({"error": str(error)})
+            return 1
+        except OSError as error:
+            _tell({"error": _unwritten(report, error)})
+            return 1
+        told = [*found.remarks, *summary(made, found), f"report        {report}"]
+    _tell({"scene": str(made.written.scene), "summary": told})
     return 0
 
 

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from spherloc.errors import CalibrationError, InputError
 from spherloc.formats.colmap_files import read_model
 from spherloc.frontend.masks import Masks
 from spherloc.geometry import camera_centre, rotation_angle, so3_exp
+from spherloc.mapping.advice import COMMAND, PAGE, for_a_page
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.make import ScaleMeasurement, make_map, scale_of
@@ -282,7 +284,22 @@ def test_a_job_tells_what_went_wrong_in_a_line(tmp_path, rng, capsys):
     picture(tmp_path / "a.png", 400, 300, rng)
     assert main(tmp_path, tmp_path / "map") == 1
     (said,) = map(json.loads, capsys.readouterr().out.splitlines())
-    assert "--camera FILE" in said["error"]
+    assert "put their calibration beside them, into that folder, and make the map again" in said["error"]
+    with pytest.raises(InputError, match="give it with --camera FILE"):
+        photographs(tmp_path, {})
+
+
+def test_what_a_map_says_on_the_page_names_no_options(walk):
+    """Errors, remarks and the summary: all words about options are those of ``advice``."""
+    assert PAGE.keys() == COMMAND.keys() and not [words for words in PAGE.values() if "--" in words]
+    sources = [path for path in Path(make_map.__code__.co_filename).parent.glob("*.py") if path.name != "advice.py"]
+    assert len(sources) > 10 and not [path for path in sources if re.search(r"--[a-z]", path.read_text("utf-8"))]
+    _, found, made, *_ = walk
+    unknown = replace(made, scale=replace(made.scale, source="", why_unknown=""), carried_deg=20.0)
+    with for_a_page():
+        on_the_page = summary(unknown, found)
+    assert not [line for line in on_the_page if "--" in line]
+    assert sum("--" in line for line in summary(unknown, found)) == 3
 
 
 def _less(written, name):
@@ -453,7 +470,7 @@ def test_a_full_disk_is_told_in_a_sentence_and_what_is_done_is_kept(walk, tmp_pa
     done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S)
     assert done.returncode == 1, done.stderr
     said = json.loads(done.stdout.splitlines()[-1])["error"]
-    assert "cannot be written" in said and "make room there and give the same command" in said
+    assert "cannot be written" in said and "make room there and make the map again" in said
     assert list((tmp_path / "map").glob("matches_*.db"))
 
 

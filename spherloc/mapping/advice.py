@@ -1,0 +1,48 @@
+"""What a user can do about a map, in the words of the command, or of the page, where there are no options."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+COMMAND = {
+    "calibration": "put {files} beside them, or give it with --camera FILE",
+    "which camera": "to choose, name the images or their folder after their camera, or give --camera-name",
+    "two circles": "have the camera's own program stitch them, or give --panorama if they are panoramas",
+    "moves along": "leave it out with --mask or --nadir",
+    "carried": " (--nadir 0: not)",
+    "more features": "; with ALIKED and LightGlue beside it: --features sift+aliked",
+    "other scale": "give --distance or --camera-height",
+    "any scale": "--camera-height, --distance or --positions gives metres",
+    "other folder": "give another --output",
+    "go on": "make room there and give the same command, which goes on with what is done",
+    "report again": "make room there and give the same command for the report",
+}
+PAGE = {
+    "calibration": "put {files} beside them, into that folder, and make the map again",
+    "which camera": "to choose, name the images or their folder after their camera",
+    "two circles": "have the camera's own program stitch them",
+    "moves along": "take photographs without it, or make the map with the command spherloc map, which takes masks",
+    "carried": "",
+    "more features": "",
+    "other scale": "the command spherloc map can take a known distance or height instead",
+    "any scale": "GPS in the photographs gives metres, or a distance or height given to the command spherloc map",
+    "other folder": "make that folder writable, or open the photographs in another one",
+    "go on": "make room there and make the map again, which goes on with what is done",
+    "report again": "make room there and make the map again for the report",
+}
+_words: ContextVar[Mapping[str, str]] = ContextVar("advice", default=COMMAND)
+
+
+def advice(about: str) -> str:
+    """A part of a sentence that says what to do: the words of the command, or of the page within ``for_a_page``."""
+    return _words.get()[about]
+
+
+@contextmanager
+def for_a_page() -> Iterator[None]:
+    """``advice`` gives the words of the page."""
+    before = _words.set(PAGE)
+    try:
+        yield
+    finally:
+        _words.reset(before)
