@@ -23,6 +23,8 @@ from spherloc.images import grey
 from spherloc.types import BoolArray, ByteArray, FloatArray
 
 SOURCE = "lines of the image"
+NOT_FOUND = "gravity cannot be found from its lines, since"
+"""What an error says before the reason."""
 
 FACE_DEG = 100.0
 """Field of view of a face: neighbouring faces overlap by ten degrees, in which an edge is seen in both."""
@@ -119,6 +121,11 @@ def gravity_from_lines(view: View, near: FloatArray | None = None) -> Gravity:
     return gravity_of_pixels(grey(view.read()), view.camera, usable, DOWN if near is None else near, view.name)
 
 
+def why_not_found(sentence: str) -> str:
+    """The reason in a sentence about gravity that lines did not give; empty in other sentences."""
+    return sentence.partition(NOT_FOUND)[2].strip()
+
+
 def gravity_of_pixels(image: ByteArray, camera: Camera, usable: BoolArray, near: FloatArray, name: str) -> Gravity:
     """``gravity_from_lines`` of a grey image (H, W) called ``name``, with its ``usable`` pixels (H, W).
 
@@ -127,7 +134,7 @@ def gravity_of_pixels(image: ByteArray, camera: Camera, usable: BoolArray, near:
     try:
         found = vertical(image_lines(image, camera, usable), near)
     except InputError as error:
-        raise InputError(f"{shorten(name)}: gravity cannot be found from its lines, since {error}") from None
+        raise InputError(f"{shorten(name)}: {NOT_FOUND} {error}") from None
     return Gravity(found.down, SOURCE, BOUND_SD * found.sd_rad, found.sd_rad)
 
 
@@ -157,7 +164,10 @@ def vertical(lines: Lines, near: FloatArray) -> Vertical:
     if rival > RIVAL_SHARE * votes.max():
         raise InputError("about as many of its edges meet in another direction.")
     if found.sd_rad > MAX_SD_RAD:
-        raise InputError(f"its vertical edges fix it to {np.degrees(found.sd_rad):.1f} degrees only.")
+        raise InputError(
+            f"its vertical edges fix it to {np.degrees(found.sd_rad):.1f} degrees (1 sd), and "
+            f"{np.degrees(MAX_SD_RAD):.1f} or less are needed."
+        )
     return Vertical(found.down, max(found.sd_rad, float(MIN_SD_RAD)), found.groups)
 
 

@@ -16,6 +16,7 @@ from spherloc.mapping.photographs import NewImages
 from spherloc.mapping.positions import Positions, gps_of_images
 from spherloc.mapping.reconstruction import DATABASES, Reconstruction, reconstruct
 from spherloc.mapping.upright import (
+    GravityByLines,
     Level,
     MapScale,
     Tell,
@@ -56,6 +57,8 @@ class Map:
     level: Level
     scale: MapScale
     written: Written
+    lines: GravityByLines
+    """Gravity of all photographs from their vertical lines."""
     groups: "tuple[Map, ...]" = ()
     """Maps of other images, which could not be joined with this one."""
     features: str = "sift"
@@ -138,12 +141,13 @@ def _map_in(
         views, _ = Masks(nadir_deg=carried_deg).on(views)
         masks = replace(masks or Masks(), nadir_deg=carried_deg)
     kept = Kept(masks, how or FrontendOptions())
-    gravity = gravity_by_lines(views, tell)
+    lines = gravity_by_lines(views, tell)
+    gravity = lines.found
     first, *others = reconstruct(views, [gravity.get(view.name) for view in views], folder, tell, how)
     found = _finished(first, views, nearer_to_others(first, others), gravity, measured, tell)
     inside = set(found[0].poses)
     written = write_map(*found, views, images, folder, new_images, kept)
-    made = Map(*found, written, features=kept.how.features.method, carried_deg=carried_deg)
+    made = Map(*found, written, lines, features=kept.how.features.method, carried_deg=carried_deg)
     groups: list[Map] = []
     for other in others:
         if len(other.poses.keys() - inside) < MIN_OF_GROUP:
@@ -161,7 +165,7 @@ def _map_in(
             place.mkdir(exist_ok=True)
         except OSError as error:
             raise InputError(f"{place}: cannot be made ({error.strerror}); {advice('other folder')}.") from None
-        groups.append(Map(*found, write_map(*found, views, images, place, new_images, kept)))
+        groups.append(Map(*found, write_map(*found, views, images, place, new_images, kept), lines))
     return replace(made, groups=tuple(groups))
 
 

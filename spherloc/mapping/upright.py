@@ -1,7 +1,6 @@
 """Gravity and scale of a model that was made from images alone."""
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from spherloc.errors import InputError, show
-from spherloc.frontend.gravity_from_lines import gravity_from_lines
+from spherloc.frontend.gravity_from_lines import gravity_from_lines, why_not_found
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN, align_to_down, camera_centre
 from spherloc.mapping.advice import advice
@@ -73,23 +72,36 @@ class MapScale:
         return {name: off for name, off in sorted(self.off_m.items(), key=lambda item: -item[1]) if off > limit_m}
 
 
-def gravity_by_lines(views: Sequence[View], tell: Tell) -> dict[str, Gravity]:
-    """Gravity of those images whose vertical lines show it, by name.
+@dataclass(frozen=True)
+class GravityByLines:
+    """What the vertical lines of images tell of gravity, by the name of the image: each is in one of both."""
+
+    found: dict[str, Gravity]
+    why_not: dict[str, str]
+    """Why lines gave no gravity, in a part of a sentence such as "it has 3 straight edges, fewer than 5."."""
+
+
+def gravity_by_lines(views: Sequence[View], tell: Tell) -> GravityByLines:
+    """Gravity of those images whose vertical lines show it, and the reasons of the others.
 
     ``tell`` is called after each image.
     """
 
-    def measure(view: View) -> Gravity | None:
-        with suppress(InputError):  # too few lines in this image
+    def measure(view: View) -> Gravity | str:
+        try:
             return gravity_from_lines(view)
-        return None
+        except InputError as error:
+            return why_not_found(str(error)) or str(error)
 
-    found = {}
-    for done, (view, gravity) in enumerate(as_completed(measure, views), start=1):
-        if gravity is not None:
-            found[view.name] = gravity
+    measured: dict[str, Gravity | str] = {}
+    for done, (view, one) in enumerate(as_completed(measure, views), start=1):
+        measured[view.name] = one
         tell("images searched for vertical lines", done, len(views))
-    return {view.name: found[view.name] for view in views if view.name in found}
+    ordered = {view.name: measured[view.name] for view in views}
+    return GravityByLines(
+        {name: one for name, one in ordered.items() if isinstance(one, Gravity)},
+        {name: one for name, one in ordered.items() if isinstance(one, str)},
+    )
 
 
 def level_of(poses: Mapping[str, FloatArray], gravity: Mapping[str, Gravity]) -> Level:
@@ -112,7 +124,12 @@ def level_of(poses: Mapping[str, FloatArray], gravity: Mapping[str, Gravity]) ->
         )
     limit_deg = max(MIN_LIMIT_DEG, LIMIT_SPREADS * spread_deg)
     leaning = {name: off for name, off in off_deg.items() if off > limit_deg}
-    source = f"vertical lines of {len(measured)} images" if by_lines else "the images' own vertical, as if held upright"
+    source = f"vertical lines of {len(measured)} images"
+    if not by_lines:
+        source = (
+            f"the images' own vertical, as if held upright, since vertical lines show it in {len(measured)} of "
+            f"{len(poses)} images and {MIN_LINES} are needed"
+        )
     return Level(down, source, spread_deg, leaning, by_lines)
 
 

@@ -39,6 +39,7 @@ from spherloc.experiments.summary import (
     vehicle_trajectory,
 )
 from spherloc.experiments.sweep_rows import csv_line
+from spherloc.frontend.gravity_from_lines import why_not_found
 from spherloc.frontend.view import View
 from spherloc.trace import Trace
 from spherloc.trajectory import write_tum
@@ -305,7 +306,7 @@ def _text(results: SequenceResults, summary: Summary) -> str:
             f"  median time {summary.median_matching_ms or 0:.0f} ms for matching, "
             f"{summary.median_estimating_ms:.1f} ms for estimating"
         )
-    lines += [f"  {line}" for line in gravity_by_source(results.rows)]
+    lines += [f"  {line}" for line in (*gravity_by_source(results.rows), *_without_lines(results.rows))]
     lines += [f"  {line}" for line in (*_skipped(summary), *_each(results), *_without_pose(results.rows))]
     if not timed(results):
         lines.append("  trajectory: times are places in the sequence, as the queries have no growing times")
@@ -369,6 +370,15 @@ def gravity_by_source(rows: Sequence[QueryResult]) -> Iterator[str]:
         off = f"; off the truth by {median(errors):.3g} deg in the median, {max(errors):.3g} at most" if errors else ""
         queries = "query" if len(told) == 1 else "queries"
         yield f"gravity from {shorten(source)} in {len(told)} {queries}, within {min(bounds):.2g}{most} deg{off}"
+
+
+def _without_lines(rows: Sequence[QueryResult]) -> Iterator[str]:
+    """A line for each of the first queries whose lines gave no gravity."""
+    reasons = {row.query: why for row in rows for remark in row.remarks if (why := why_not_found(remark))}
+    for query, why in list(reasons.items())[:MAX_TOLD]:
+        yield f"no gravity from lines of {query}: {why}"
+    if len(reasons) > MAX_TOLD:
+        yield f"no gravity from lines of {len(reasons) - MAX_TOLD} more, see results.csv"
 
 
 def _rate(rate: SuccessRate, unit: str) -> str:

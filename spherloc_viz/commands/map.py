@@ -223,6 +223,7 @@ def summary(made: Map, found: Photographs) -> list[str]:
         f"in the map    {len(written.poses)} of {len(found.views)} images, {len(written.points):,} points, "
         f"{written.error_px:.2f} px mean error",
         f"down          from {made.level.source}; single images differ by {made.level.spread_deg:.1f}° (median)",
+        *_about_lines(made),
         f"features      {about_features(made)}",
         f"scale         {made.scale.source or _units_unknown(made)}",
     ]
@@ -241,6 +242,16 @@ def summary(made: Map, found: Photographs) -> list[str]:
     if far := made.scale.misplaced:
         lines.append(f"in doubt      {_far_words(far)}")
     return lines
+
+
+def _about_lines(made: Map) -> list[str]:
+    """A line on the photographs whose lines gave no gravity; none if all did."""
+    without = made.lines.why_not
+    if not without:
+        return []
+    name, why = next(iter(without.items()))
+    count = f"{len(without)} of {len(without) + len(made.lines.found)} images"
+    return [f"no gravity    from the lines of {count} (see the report), such as {name}: {why}"]
 
 
 def _carried_words(degrees: float) -> str:
@@ -305,6 +316,7 @@ def map_report(made: Map, found: Photographs) -> str:
             "<h2>Not in the map</h2>" if left else "",
             *(_thumbnail(view, made, names) for view in left[:MAX_THUMBNAILS]),
             "<h2>Images</h2><table><tr><th>image</th><th>in the map</th><th>best partner</th><th>matches</th>"
+            "<th>gravity from its lines</th>"
             f"{'<th>off its position</th>' if made.scale.off_m else ''}</tr>",
             *rows,
             "</table></body></html>",
@@ -327,14 +339,25 @@ def _doubts(made: Map) -> list[str]:
 
 
 def _row(made: Map, names: list[str], index: int) -> str:
-    counts = made.made.matches[index]
+    name, counts = names[index], made.made.matches[index]
     best = int(counts.argmax())
-    inside = names[index] in made.written.poses
-    partner = names[best] if counts[best] else "none"
-    return (
-        f"<tr><td>{html.escape(names[index])}</td><td{'' if inside else ' class=out'}>{'yes' if inside else 'no'}</td>"
-        f'<td>{html.escape(partner)}</td><td class="number">{counts[best]:,}</td>{_off(made, names[index])}</tr>'
-    )
+    inside = name in made.written.poses
+    cells = [
+        f"<td>{html.escape(name)}</td>",
+        f"<td{'' if inside else ' class=out'}>{'yes' if inside else 'no'}</td>",
+        f"<td>{html.escape(names[best] if counts[best] else 'none')}</td>",
+        f'<td class="number">{counts[best]:,}</td>',
+        f"<td>{html.escape(_lines_of(made, name))}</td>",
+        _off(made, name),
+    ]
+    return f"<tr>{''.join(cells)}</tr>"
+
+
+def _lines_of(made: Map, name: str) -> str:
+    """What the lines of an image tell of gravity: its bound, or why they tell nothing."""
+    if name in made.lines.why_not:
+        return f"none: {made.lines.why_not[name]}"
+    return f"within {np.degrees(made.lines.found[name].bound_rad or 0.0):.1f}°"
 
 
 def _off(made: Map, name: str) -> str:

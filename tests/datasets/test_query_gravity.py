@@ -14,8 +14,10 @@ from spherloc.errors import InputError, ProblemError
 from spherloc.estimators import default_options
 from spherloc.experiments.results import json_line, row_of_json
 from spherloc.experiments.sequence import localize
+from spherloc.frontend.gravity_from_lines import NOT_FOUND
 from spherloc.frontend.view import Gravity, Matches, View
 from spherloc.geometry import DOWN
+from spherloc_viz.commands.localize import _without_lines as without_lines
 from spherloc_viz.commands.localize import gravity_by_source as summed_up
 from spherloc_viz.commands.run import as_record, as_text
 from tests.datasets.test_image_folder import CAMERA, POSED, make_tree
@@ -250,3 +252,9 @@ def test_runs_and_sequences_say_where_gravity_came_from(tmp_path, problem):
         "gravity from the IMU in 2 queries, within 0.57 to 2 deg; off the truth by 0.75 deg in the median, 1.5 at most",
         "gravity from lines in 1 query, within 0.57 deg; off the truth by 0 deg in the median, 0 at most",
     ]
+    why = "it has 3 straight edges, fewer than 5. Gravity is that of the most similar reference."
+    remarks = ("It is dark.", f"q.png: {NOT_FOUND} {why}")
+    without = [replace(row, query=f"{number}.png", remarks=remarks) for number in range(7)]
+    said = list(without_lines([row, *without]))
+    assert said[0] == f"no gravity from lines of 0.png: {why}" and len(said) == 6
+    assert said[5] == "no gravity from lines of 2 more, see results.csv"

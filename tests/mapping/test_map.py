@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from spherloc import registry
+from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.datasets import bundled_scenes, load_scene
@@ -115,7 +116,7 @@ def test_the_report_says_what_is_in_the_map(walk):
     _, found, made, *_ = walk
     page = map_report(made, found)
     assert "5 of 5" in page and "Not in the map" not in page and "data:image/png;base64," in page
-    smaller = map_report(type(made)(made.made, made.level, made.scale, _less(made.written, "reference_004.png")), found)
+    smaller = map_report(replace(made, written=_less(made.written, "reference_004.png")), found)
     assert "4 of 5" in smaller and "reference_004.png: It has " in smaller
     alone = made.made.matches.copy()
     alone[3:, :3] = alone[:3, 3:] = 0
@@ -304,7 +305,7 @@ def test_what_a_map_says_on_the_page_names_no_options(walk):
 
 def _less(written, name):
     poses = {key: value for key, value in written.poses.items() if key != name}
-    return type(written)(written.scene, written.new_scene, poses, written.points, written.error_px)
+    return replace(written, poses=poses)
 
 
 def written(camera):
@@ -514,7 +515,7 @@ def test_an_image_that_was_left_out_is_placed(walk, capfd):
     made, name, tell = again(), "reference_004.png", lambda *what: None
     unit = made.written.poses
     before = unit[name]
-    gravity = gravity_by_lines(found.views, tell)
+    gravity = gravity_by_lines(found.views, tell).found
     level = level_of(unit, gravity)
     less = replace(made.made, poses=unit).without([name])  # what was written was levelled and scaled
     assert place_rest(less, found.views, [name], gravity, level, tell) is less
@@ -536,8 +537,28 @@ def test_images_that_lean_against_the_map_are_told(walk):
     turned = dict(made.written.poses)
     name = sorted(turned)[2]
     turned[name] = np.column_stack([so3_exp(np.array([0.1, 0.0, 0.0])) @ turned[name][:, :3], turned[name][:, 3]])
-    level = level_of(turned, gravity_by_lines(found.views, lambda *what: None))
+    level = level_of(turned, gravity_by_lines(found.views, lambda *what: None).found)
     assert list(level.leaning) == [name] and level.leaning[name] == pytest.approx(np.degrees(0.1), abs=1.0)
+
+
+def test_why_lines_give_no_gravity_is_told_of_each_image(walk, tmp_path):
+    """In the summary of the first one, in the report of each, and with the number that is needed for a map."""
+    _, found, made, *_ = walk
+    assert made.lines.found.keys() == made.written.poses.keys() and not made.lines.why_not
+    assert "no gravity" not in "".join(summary(made, found)) and "<td>within " in map_report(made, found)
+    name = sorted(made.lines.found)[1]
+    assert cv2.imwrite(str(tmp_path / "blank.png"), np.full((200, 400), 90, np.uint8))
+    blank = replace(found.views[1], path=tmp_path / "blank.png", camera=Equirectangular(400, 200), mask=None)
+    lines = gravity_by_lines([found.views[0], blank], lambda *what: None)
+    assert list(lines.found) == [found.views[0].name]
+    assert lines.why_not == {name: "it has 0 straight edges, fewer than 5."}
+    others = {key: value for key, value in made.lines.found.items() if key != name}
+    told = replace(made, lines=replace(made.lines, found=others, why_not=lines.why_not))
+    assert f"<td>none: {lines.why_not[name]}</td>" in map_report(told, found)
+    (said,) = [line for line in summary(told, found) if line.startswith("no gravity ")]
+    assert said.endswith(f"the lines of 1 of 5 images (see the report), such as {name}: {lines.why_not[name]}")
+    level = level_of(made.written.poses, lines.found)
+    assert level.source.endswith("vertical lines show it in 1 of 5 images and 3 are needed")
 
 
 def test_photographs_of_an_unknown_camera_are_told_by_size(tmp_path, rng):
