@@ -14,8 +14,8 @@ from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.estimators import estimate
 from spherloc.trace import ConsensusStage, Trace, TranslationStage
 from spherloc_viz import style
-from spherloc_viz.app.plots.graph_view import MAX_EDGES, cell_nodes, edges_of, graph_html, graph_note, matrix_png
 from spherloc_viz.app.plots.ball_list import ball_list_html, selected_rows
+from spherloc_viz.app.plots.graph_view import MAX_EDGES, cell_nodes, edges_of, graph_html, graph_note, matrix_png
 from spherloc_viz.layers import graph_begins, paint, steps
 from spherloc_viz.layers.primitives import Graph
 from spherloc_viz.layers.translation import MAX_NODES, BallSet, ball_nodes, graph_at
@@ -174,7 +174,7 @@ def test_all_balls_are_listed_with_the_clique_first(mc: Trace) -> None:
 
     kept = np.arange(len(mc.problem)) + 1000
     lit = selected_rows(rows, tuple(rows.pairs[3].tolist()))
-    html = ball_list_html(rows, 0, lit, kept, style.CLIQUE, "in the maximum clique")
+    html = ball_list_html(rows, 0, lit, kept, style.CLIQUE, "in the clique")
     a, b = (rows.pairs[3] + 1000).tolist()
     assert f'data-touch="select:{a},{b}"' in html and html.count("data-reveal") == 1 and f"ball-{a}-{b}" in html
     assert html.count(">yes<") == min(size, 25) and ElementTree.fromstring(f"<div>{html}</div>").tag == "div"

@@ -23,14 +23,14 @@ def ball_list_html(
     rows: BallRows, page: int, lit: NDArray[np.int64], kept: NDArray[np.int64], color: style.RGB, marks: str
 ) -> str:
     """A page of the list. ``lit`` are the selected rows, ``kept`` (N,) the numbers of the matches on the page;
-    ``marks`` names what the first ``rows.marked`` balls, in a ``color``, are members of."""
+    ``marks`` says what the first ``rows.marked`` balls, told in a ``color``, are."""
     count, chosen = len(rows.radii), frozenset(lit.tolist())
     shown = range(page * PAGE, min((page + 1) * PAGE, count))
     revealed = next((k for k in shown if k in chosen), -1)
     body = "".join(_row(rows, k, k in chosen, k == revealed, kept, color) for k in shown)
     member = f'<th style="text-align:left;{CELL}">{marks}</th>' if rows.marked else ""
     head = (
-        f'<th style="text-align:left;{CELL}">ball of matches</th><th style="{RIGHT}">radius</th>'
+        f'<th style="text-align:left;{CELL}">matches</th><th style="{RIGHT}">radius</th>'
         f'<th style="{RIGHT}" title="Other balls of this list that it overlaps">overlaps</th>{member}'
     )
     table = '<table style="border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums;font-size:12.5px">'

@@ -269,7 +269,8 @@ class GraphView:
         if selected != self._followed:
             self._followed = selected
             self._page = page_of(lit, self._page)
-        marks = "in the maximum clique" if graph.color == style.CLIQUE else "in this step's set"
+        whole = graph.color == style.CLIQUE and np.count_nonzero(graph.marked) == graph.nodes.clique
+        marks = "in the clique" if whole else "marked"
         words = f'<div style="padding-bottom:.2em">{linked(graph.words)}</div>'
         return box(_title(graph, LIST) + words + ball_list_html(rows, self._page, lit, kept, graph.color, marks))
 
@@ -305,11 +306,12 @@ def graph_html(graph: Graph, selected: tuple[int, ...], kept: NDArray[np.int64])
 
 def _title(graph: Graph, look: str) -> str:
     """The heading; where nodes are balls, with buttons for the looks."""
-    title = f'<div style="font-weight:600;padding-bottom:.3em">Graph and matrix{help_html("graph")}</div>'
-    if graph.list_balls is None:
-        return title
-    names = ("drawing", f"list of {graph.count:,} {'ball' if graph.count == 1 else 'balls'}")
-    return title + "".join(chip(name, f"{LOOK}:{one}", one == look) for one, name in zip(LOOKS, names, strict=True))
+    chips = ""
+    if graph.list_balls is not None:
+        names = ("drawing", f"list of {graph.count:,}")
+        chips = "".join(chip(name, f"{LOOK}:{one}", one == look) for one, name in zip(LOOKS, names, strict=True))
+    title = f'<span style="font-weight:600;margin-right:auto">Graph and matrix{help_html("graph")}</span>'
+    return f'<div style="display:flex;flex-wrap:wrap;align-items:baseline">{title}{chips}</div>'
 
 
 def _waiting_html(begins: str) -> str:
