@@ -16,9 +16,9 @@ import numpy as np
 from spherloc.bounds import bounds_of
 from spherloc.consensus.chance import chance_rate, expected_text
 from spherloc.consensus.inliers import mark_each
+from spherloc.consensus.spread import spread_in
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.evidence import MIN_SDS, agreeing, different, sd_of
-from spherloc.diagnosis.spread import spread_in
 from spherloc.free_gravity import MAX_NFA, MIN_LEAD, count_distinct, expected_by_chance, lead, nearby_support
 from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M

@@ -9,9 +9,9 @@ import numpy as np
 
 from spherloc.bounds import Bounds, bounds_of
 from spherloc.consensus.chance import chance_rate, nfa
+from spherloc.consensus.spread import Spread, spread_in
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.causes import Measures
-from spherloc.diagnosis.spread import Spread, spread_in
 from spherloc.estimators.base import estimate
 from spherloc.estimators.mc_exact import McExactOptions
 from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD, tilt_of

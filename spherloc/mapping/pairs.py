@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.diagnosis.spread import joined, spread_of
+from spherloc.consensus.spread import joined, spread_of
 from spherloc.frontend.feature_kinds import Descriptors
 from spherloc.frontend.features import Features
 from spherloc.frontend.matching import MatchOptions, match
@@ -127,7 +127,7 @@ class ImagePairs:
         """Whether what fits of the matches (M, 2) may be a thing that stands at two places."""
         rays = self._bearings[first][pairs[:, 0]], self._bearings[second][pairs[:, 1]]
         fits = fitting(*rays, *relative(geometry), self._bound_rad)
-        return on_one_thing((self._cameras[first], self._cameras[second]), rays, fits)
+        return fit_on_one_thing((self._cameras[first], self._cameras[second]), rays, fits)
 
     def _geometry(self, first: int, second: int, pairs: NDArray[np.uint32]) -> Any:
         if len(pairs) < MIN_MATCHES:
@@ -191,7 +191,7 @@ class ImagePairs:
         return geometry.config != self._pycolmap.TwoViewGeometryConfiguration.CALIBRATED
 
 
-def on_one_thing(cameras: tuple[Camera, Camera], rays: tuple[FloatArray, FloatArray], fits: BoolArray) -> bool:
+def fit_on_one_thing(cameras: tuple[Camera, Camera], rays: tuple[FloatArray, FloatArray], fits: BoolArray) -> bool:
     """Whether two panoramas show one thing that may stand at two places: few of their matches, with bearings (M, 3) in
     each, fit a pose, and hardly any outside a part of the view. False for other cameras."""
     spreads = [spread_of(camera, seen, fits) for camera, seen in zip(cameras, rays, strict=True)]

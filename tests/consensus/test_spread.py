@@ -8,11 +8,11 @@ import pytest
 
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.consensus.spread import MAX_RADIUS_DEG, MIN_REST, spread_of
 from spherloc.diagnosis.causes import Cause
 from spherloc.diagnosis.decide import diagnose
-from spherloc.diagnosis.spread import MAX_RADIUS_DEG, MIN_REST, spread_of
 from spherloc.estimators.base import estimate
-from spherloc.mapping.pairs import on_one_thing
+from spherloc.mapping.pairs import fit_on_one_thing
 from spherloc.outcome import Outcome, judge
 
 PANORAMA = Equirectangular(400, 200)
@@ -92,6 +92,6 @@ def test_panoramas_that_fit_on_one_thing(rng, shelf, elsewhere, left_out):
         np.concatenate([around(rng, middle, 15.0, shelf), around(rng, np.negative(middle), 90.0, 120)])
         for middle in ([0.2, 0.1, 1.0], [1.0, -0.2, 0.1])
     )
-    assert on_one_thing((PANORAMA, PANORAMA), rays, fits) is left_out
+    assert fit_on_one_thing((PANORAMA, PANORAMA), rays, fits) is left_out
     fisheye = KannalaBrandt(400, 400, 90, 90, 200, 200, (0.0,) * 4)
-    assert not on_one_thing((PANORAMA, fisheye), rays, fits)
+    assert not fit_on_one_thing((PANORAMA, fisheye), rays, fits)
