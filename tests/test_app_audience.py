@@ -29,6 +29,8 @@ MAY_PRESS = {
     "views",
     "yaw-zoom",
     "graph-cell",
+    "graph-look",
+    "ball-page",
     "select-bin",
     "image-pick",
     "image-reference",

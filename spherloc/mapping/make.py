@@ -93,7 +93,7 @@ def make_map(
         if name not in names:
             raise InputError(f"{show(name)} is not one of the {len(views)} photographs; give the names of two files.")
     with _folder_of_map(folder):
-        return _map_in(folder, views, images, measured, new_images, tell, masks, how, find_carried)
+        return _map_in(folder, views, images, measured, new_images, tell, masks, how, find_carried=find_carried)
 
 
 @contextmanager
@@ -131,6 +131,7 @@ def _map_in(
     tell: Tell,
     masks: Masks | None,
     how: FrontendOptions | None,
+    *,
     find_carried: bool,
 ) -> Map:
     """``make_map`` in a folder that is there."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.transforms import Bbox
+from matplotlib.figure import Figure
 
 from spherloc.errors import shorten
 from spherloc.types import FloatArray
@@ -36,22 +36,22 @@ class PlaceName:
 
 def write_labels(axes: Axes, labels: Sequence[PlaceName], dots: FloatArray) -> None:
     """Write the labels after all else is drawn; ``dots`` (N, 2) are places that no name should cover."""
-    canvas = axes.figure.canvas
-    assert isinstance(canvas, FigureCanvasAgg)
-    axes.figure.draw_without_rendering()  # fixes where the axes are
-    renderer, edge = canvas.get_renderer(), axes.get_window_extent()
+    figure = axes.figure
+    assert isinstance(figure, Figure) and isinstance(figure.canvas, FigureCanvasAgg)
+    figure.draw_without_rendering()  # fixes where the axes are
+    renderer, edge = figure.canvas.get_renderer(), np.asarray(axes.get_window_extent().extents)
     centres = axes.transData.transform(np.reshape(dots, (-1, 2)))
     taken = [np.concatenate([centre - DOT_PX, centre + DOT_PX]) for centre in centres]
     for label in labels:
         text = axes.annotate(
-            shorten(label.name, MAX_LETTERS), label.place, xytext=_SPOTS[0], textcoords="offset points",
+            shorten(label.name, MAX_LETTERS), tuple(label.place.tolist()), xytext=_SPOTS[0], textcoords="offset points",
             fontsize=FONT_SIZE, color=label.color, parse_math=False, annotation_clip=False,
         )  # fmt: skip
         text.set_in_layout(False)
         tried = []
         for spot in _SPOTS:
             _move(text, spot)
-            box = text.get_window_extent(renderer).extents
+            box = np.asarray(text.get_window_extent(renderer).extents)
             tried.append((_outside(box, edge) + sum(_common(box, other) for other in taken), spot, box))
         _, spot, box = min(tried, key=lambda one: one[0])
         _move(text, spot)
@@ -71,6 +71,6 @@ def _common(one: FloatArray, other: FloatArray) -> float:
     return float(np.prod(np.maximum(size, 0.0)))
 
 
-def _outside(box: FloatArray, edge: Bbox) -> float:
+def _outside(box: FloatArray, edge: FloatArray) -> float:
     """Area of a box beyond the edge, px^2."""
-    return float(np.prod(box[2:] - box[:2])) - _common(box, edge.extents)
+    return float(np.prod(box[2:] - box[:2])) - _common(box, edge)

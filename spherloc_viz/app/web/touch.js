@@ -6,12 +6,12 @@
 // scrolls or presses. What a new link with data-fetch leads to is downloaded. When another step or problem comes, a panel
 // that was scrolled past its title shows its beginning.
 (() => {
-  const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150, FOLDED_LOOKS = 8;
+  const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150;
   const REVEAL_MS = 3000, COPIED_MS = 5000;
   let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, titled = null;
   // The tabs of a step and of a link that were opened last, among the views and elsewhere, and the last report.
   let front = "", asked = "", elsewhere = "", told = "";
-  const fetched = new Set(), hidden = {};  // downloads that were begun; and for how many looks a tab had no place
+  const fetched = new Set();  // downloads that were begun
 
   function found(event) {
     const element = event.target instanceof Element ? event.target.closest(`${TOUCHABLE},a[href]`) : null;
@@ -43,15 +43,13 @@
     tell(`views:${report}`, nowhere, { clientX: 0, clientY: 0, shiftKey: false }, { x: 0, y: 0 });
   }
 
-  // Opens a tab of the views; false as long as it is not to be seen, unless its panel is folded: then it has no place for
-  // a while, as it also has while the page is built. Tabs can be dragged, so that a click does nothing; Enter is what
-  // their own keys know.
+  // Opens a tab of the views; false as long as it is not to be seen, as while the page is built or its panel is folded.
+  // Tabs can be dragged, so that a click does nothing; Enter is what their own keys know.
   function openTab(name) {
     if ((seen ?? "").split(",").includes(name)) return true;
     const tab = [...document.querySelectorAll("[role=tab]")].find((one) => one.textContent.trim() === name);
     tab?.dispatchEvent(new KeyboardEvent("keydown", { key: "Enter", bubbles: true, cancelable: true }));
-    hidden[name] = tab !== undefined && tab.getClientRects().length === 0 ? (hidden[name] ?? 0) + 1 : 0;
-    return hidden[name] > FOLDED_LOOKS;
+    return false;
   }
 
   const linkedTab = () => document.querySelector("[data-tab]")?.dataset.tab ?? "";
