@@ -38,6 +38,7 @@ from spherloc.errors import InputError
 from spherloc.estimators.base import estimate, options_type
 from spherloc.narrowing import MAX_DESCENTS, NARROWINGS, descend, narrow, search_nearby, truncated_squares
 from spherloc.problem import Problem
+from spherloc.processors import processor_count
 from spherloc.refine import (
     MAX_RESCUES,
     MAX_STEPS,
@@ -75,7 +76,7 @@ def warm_up(announce: Callable[[str], None] | None = None, estimators: Iterable[
             if kernel_cache.is_temporary():
                 how_often = "at every start, as no folder to keep them can be written (NUMBA_CACHE_DIR names another)"
             announce(f"compiling the solvers, {how_often}: {_expected(cold)} …")
-        if _processors() > 1:
+        if processor_count() > 1:
             # The rest of the fastest estimator is compiled here, before another process would have started.
             apart = [part for part in cold if not part.startswith(FASTEST)]
             _compile_in_order(apart, told=lambda done: announce and announce(f"{done} of {len(cold)} parts compiled"))
@@ -226,7 +227,7 @@ def _compile_at_once(
     parts: Sequence[str], stopped: Callable[[], bool], niceness: int, told: Callable[[int], object]
 ) -> None:
     """Compile parts in processes of their own, as many at once as there are processors."""
-    lanes, done = min(MAX_PROCESSES, _processors()), 0
+    lanes, done = min(MAX_PROCESSES, processor_count()), 0
     waiting, running = deque(parts), []
     try:
         while (waiting or running) and not stopped():
@@ -245,10 +246,6 @@ def _compile_at_once(
         for process in running:
             process.kill()
             process.wait()
-
-
-def _processors() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _expected(cold: Sequence[str]) -> str:

@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SCREENS = {"viser", "rerun", "rerun_sdk", "rerun_bindings", "plotly", "aiohttp", "tyro", "spherloc_viz"}
 
 FLOORS = (
-    ("spherloc.errors", "spherloc.types", "spherloc.proof_check", "spherloc"),
+    ("spherloc.errors", "spherloc.types", "spherloc.processors", "spherloc.proof_check", "spherloc"),
     (
         "spherloc.files",
         "spherloc.ranges",

@@ -26,7 +26,9 @@ every graph.
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from spherloc.consensus.pair_rows import fill_rows
 from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.types import FloatArray, IndexArray
@@ -34,6 +36,8 @@ from spherloc.watch import DONE, Watch, stopped
 
 CIRCLE = 4.0
 """Turns of the whole circle."""
+MAX_ARCS = 2
+"""Arcs of a pair."""
 ROUNDING = 1e-12
 """Slack of every condition, relative to its amplitude, so that rounding never excludes the true yaw."""
 
@@ -137,12 +141,16 @@ def pair_arcs(aligned: AlignedProblem, bound_rad: FloatArray, watch: Watch | Non
     watch = watch or Watch()
     count = len(aligned.bearings)
     watch.expect(count * (count - 1) // 2)
-    room = 2 * (count * (count - 1) // 2)
+    room = MAX_ARCS * (count * (count - 1) // 2)
     # Memory that is never touched is never used, so room for the worst case costs nothing.
     arcs = Arcs(np.empty((room, 2), np.int32), np.empty(room), np.empty(room))
-    used = _fill(aligned.bearings, aligned.points, bound_rad, arcs, watch.board)
+
+    def fill(rows: tuple[int, int], part: tuple[NDArray, ...]) -> int:
+        return _fill(aligned.bearings, aligned.points, bound_rad, rows, Arcs(*part), watch.board)
+
+    found = fill_rows(count, MAX_ARCS, arcs, fill)
     watch.check()
-    return Arcs(arcs.pairs[:used], arcs.lo[:used], arcs.hi[:used])
+    return Arcs(*found)
 
 
 @kernel()
@@ -190,8 +198,9 @@ def _behind(wave, u0, v0, u1, v1):
 
 
 @kernel()
-def _fill(bearings, points, eps, arcs, board):
-    """Write the arcs of ``pair_arcs`` to the ``Arcs`` ``arcs``, which have room for all; returns how many.
+def _fill(bearings, points, eps, rows, arcs, board):
+    """Write the arcs of the pairs (i, j) with i from ``rows[0]`` up to ``rows[1]`` to the ``Arcs`` ``arcs``, which have
+    room for all; returns how many.
 
     ``bearings`` (M, 3), ``points`` (M, 3), m, ``eps`` (M,), rad. A watch's ``board`` counts the pairs and can end it.
     """
@@ -201,7 +210,7 @@ def _fill(bearings, points, eps, arcs, board):
         chords[i], sines[i] = chord(eps[i]), np.sin(eps[i])
     # All waves of a bearing before their arcs: branches that cannot be predicted then do not wait for the waves.
     waves, is_bounded = np.empty((len(eps), 4, 3)), np.empty(len(eps), np.bool_)
-    for i in range(len(bearings)):
+    for i in range(rows[0], rows[1]):
         if stopped(board):
             break
         for j in range(i + 1, len(bearings)):

@@ -7,7 +7,6 @@ result does not depend on how many threads there are or how fast each of them is
 the largest bound among its tasks is what is proven.
 """
 
-import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -35,6 +34,7 @@ from spherloc.consensus.pose_search import (
 )
 from spherloc.consensus.yaw_bins import BINS
 from spherloc.problem import AlignedProblem
+from spherloc.processors import processor_count
 from spherloc.types import FloatArray
 from spherloc.watch import DONE, Watch, working_s
 
@@ -116,8 +116,7 @@ def search_positions(
 
 def threads_to_use() -> int:
     """Threads for the tasks of a round."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(TASKS_A_ROUND, cores)
+    return min(TASKS_A_ROUND, processor_count())
 
 
 class _Worker:

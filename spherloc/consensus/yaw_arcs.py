@@ -16,8 +16,10 @@ them finds the deepest yaw exactly, in O(A log A). (Eq. 37 as printed has the in
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spherloc.consensus.pair_arcs import chord, pair_sinusoids
+from spherloc.consensus.pair_rows import fill_rows
 from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.types import FloatArray, IndexArray
@@ -52,9 +54,13 @@ def yaw_arcs(
     # Memory that is never touched is never used, so room for the worst case costs nothing.
     pairs = np.empty((room, 2), np.int32)
     lo, hi = np.empty(room), np.empty(room)
-    used = _fill(aligned.bearings, aligned.points, bound_rad, widest_rad, pairs, lo, hi, watch.board)
+
+    def fill(rows: tuple[int, int], part: tuple[NDArray, ...]) -> int:
+        return _fill(aligned.bearings, aligned.points, bound_rad, widest_rad, rows, part, watch.board)
+
+    pairs, lo, hi = fill_rows(count, MAX_ARCS, (pairs, lo, hi), fill)
     watch.check()
-    return pairs[:used], lo[:used], hi[:used]
+    return pairs, lo, hi
 
 
 @kernel(inline="always")
@@ -181,17 +187,18 @@ def _arcs_at_roots(f, tau, most_i, most_j, arcs):
 
 
 @kernel()
-def _fill(bearings, points, eps, widest, pairs, lo, hi, board):
-    """Write the arcs of ``yaw_arcs`` to ``pairs`` (K, 2), ``lo`` (K,) and ``hi`` (K,), rad; returns how many.
+def _fill(bearings, points, eps, widest, rows, found, board):
+    """Write the arcs of the pairs (i, j) with i from ``rows[0]`` up to ``rows[1]`` to the arrays ``found``: pairs
+    (K, 2), first and second ends (K,), (K,), rad. Returns how many.
 
     ``bearings`` (M, 3), ``points`` (M, 3), m, ``eps`` (M,), rad, ``widest`` in rad. A watch's ``board`` counts the
     pairs and can end it.
     """
-    used = 0
+    used, (pairs, lo, hi) = 0, found
     chords, sines = chord(eps), np.sin(eps)
     least_cosine = np.cos(widest) - MIN_SINE if widest < np.pi else -2.0
     arcs = np.empty((2 * MAX_ARCS, 4))
-    for i in range(len(bearings)):
+    for i in range(rows[0], rows[1]):
         if stopped(board):
             break
         for j in range(i + 1, len(bearings)):

@@ -158,6 +158,14 @@ def check_switches(options: Any) -> None:
             raise InputError(f"option {item.name} is {show(value)}; give true or false.")
 
 
+def check_sampling(options: Any, most: int) -> None:
+    """Raise ``InputError`` if ``iterations`` is no whole number up to ``most``, or ``confidence`` no probability."""
+    if options.iterations != int(options.iterations) or options.iterations > most:
+        raise InputError(f"option iterations is {options.iterations}; give a whole number up to {most:,}.")
+    if options.confidence is not None and options.confidence >= 1.0:
+        raise InputError(f"option confidence is {options.confidence}; give a probability below 1.")
+
+
 def estimate_faults(result: Any, count: int) -> list[str]:
     """What of an estimator's result has a form that cannot become a trace of ``count`` usable matches, in words."""
     pose = result.cam_from_map

@@ -9,7 +9,7 @@ from spherloc.bounds import Bounds
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.two_point_search import Scoring, TwoPointSearch, search_two_point
 from spherloc.errors import InputError, show
-from spherloc.estimators.base import Clock, Estimate, check_positive, check_switches
+from spherloc.estimators.base import Clock, Estimate, check_positive, check_sampling, check_switches
 from spherloc.geometry import level_poses
 from spherloc.last_step import conclude, conclude_as_printed
 from spherloc.problem import AlignedProblem
@@ -43,10 +43,7 @@ class RansacOptions(RefinementOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(self)
-        if self.iterations != int(self.iterations) or self.iterations > MAX_ITERATIONS:
-            raise InputError(f"option iterations is {self.iterations}; give a whole number up to {MAX_ITERATIONS:,}.")
-        if self.confidence is not None and self.confidence >= 1.0:
-            raise InputError(f"option confidence is {self.confidence}; give a probability below 1.")
+        check_sampling(self, MAX_ITERATIONS)
         if self.scoring not in get_args(Scoring):
             raise InputError(f"option scoring is {show(self.scoring)}; give one of {', '.join(get_args(Scoring))}.")
         check_switches(self)

@@ -20,7 +20,7 @@ import numpy as np
 
 from spherloc.bounds import Bounds
 from spherloc.errors import InputError, show
-from spherloc.estimators.base import Clock, Estimate, check_positive, check_switches
+from spherloc.estimators.base import Clock, Estimate, check_positive, check_sampling, check_switches
 from spherloc.last_step import conclude, conclude_as_printed
 from spherloc.metrics import ransac_success_probability
 from spherloc.problem import AlignedProblem
@@ -66,10 +66,7 @@ class SolverRansacOptions(RefinementOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(self)
-        if self.iterations != int(self.iterations) or self.iterations > MAX_ITERATIONS:
-            raise InputError(f"option iterations is {self.iterations}; give a whole number up to {MAX_ITERATIONS:,}.")
-        if self.confidence is not None and self.confidence >= 1.0:
-            raise InputError(f"option confidence is {self.confidence}; give a probability below 1.")
+        check_sampling(self, MAX_ITERATIONS)
         check_switches(self)
 
 

@@ -1,9 +1,10 @@
 """Work on images or pairs of them on all processors."""
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import TypeVar
+
+from spherloc.processors import processor_count
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -16,7 +17,7 @@ def as_completed(work: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator
 
     Only a few are started ahead, and an interruption waits for those that run.
     """
-    workers = max(1, min(MAX_WORKERS, os.cpu_count() or 1))
+    workers = max(1, min(MAX_WORKERS, processor_count()))
     running: dict[Future[Result], Job] = {}
     left = iter(jobs)
     pool = ThreadPoolExecutor(workers)

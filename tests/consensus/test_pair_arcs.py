@@ -6,8 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pair_samples import aligned_problem, sample, unit
 
+from spherloc.consensus import pair_rows
 from spherloc.consensus.pair_arcs import CIRCLE, direction_of_turn, pair_arcs, turn_of, yaws_between
 from spherloc.consensus.yaw_arcs import yaw_arcs
+from spherloc.watch import Cancelled, Watch
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -80,6 +82,22 @@ def test_true_yaw_is_inside_where_pairs_are_special(rng, kind, bound):
         check_ends(pairs, lo, hi)
         held = np.unique(by_pair(pairs[covered(turn_of(np.array(yaw)), lo, hi, 4e-15)], count))
         assert len(held) == count * (count - 1) // 2
+
+
+@pytest.mark.parametrize("arcs_of", [pair_arcs, yaw_arcs])
+def test_threads_change_nothing(rng, monkeypatch, arcs_of):
+    s = sample(rng, 1e-2, 60)
+    monkeypatch.setattr(pair_rows, "processor_count", lambda: 1)
+    watch = Watch()
+    alone = arcs_of(s.aligned, s.bound_rad, watch=watch)
+    monkeypatch.setattr(pair_rows, "processor_count", lambda: 3)
+    monkeypatch.setattr(pair_rows, "MIN_PAIRS", 0)
+    assert len(alone[0]) > 300
+    for one, other in zip(alone, arcs_of(s.aligned, s.bound_rad), strict=True):
+        np.testing.assert_array_equal(one, other)
+    watch.cancel()
+    with pytest.raises(Cancelled):
+        arcs_of(s.aligned, s.bound_rad, watch=watch)
 
 
 @pytest.mark.parametrize("bound", BOUNDS)

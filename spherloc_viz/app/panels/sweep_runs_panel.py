@@ -1,7 +1,6 @@
 """A sweep over the page's simulation, in processes of its own, drawn as it grows."""
 
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from spherloc.errors import InputError, SpherlocError
 from spherloc.experiments.sweep import AXES, Entrant, SweepPlan, SweepRow, planned, run_sweep
 from spherloc.experiments.sweep_plan import parse_values
 from spherloc.experiments.sweep_rows import rows_text, summarize, summary_text
+from spherloc.processors import processor_count
 from spherloc_viz.app.catalog import SceneRequest
 from spherloc_viz.app.panels.compare_panel import chips_html, ordered
 from spherloc_viz.app.plots.charts import charts_html, table_html
@@ -83,7 +83,7 @@ class SweepPanel:
         self._runs = gui.add_number(
             "Runs", 20, min=1, max=10_000, step=1, hint="Problems at each value, the same for all."
         )
-        most = os.cpu_count() or 1
+        most = processor_count()
         self._workers = gui.add_number(
             "Workers", min(2, most), min=1, max=most, step=1, hint="Processes beside this page."
         )

@@ -1,7 +1,6 @@
 """Brings the list of runs up to date with the files of its folder, which other processes read."""
 
 import contextlib
-import os
 import sqlite3
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Literal, Protocol, TypeVar
 
 from spherloc.errors import RecordingError
+from spherloc.processors import processor_count
 from spherloc_viz.given_files import REVIEW_SUFFIX
 from spherloc_viz.recording.index.query import put
 from spherloc_viz.recording.reviews import UNREADABLE, has_review, review_path
@@ -71,7 +71,7 @@ def _side_by_side(
     worth_a_worker: int,
     examiners: Examiners,
 ) -> Generator[tuple[Path, T], None, None]:
-    workers = max(1, min(MAX_WORKERS, os.cpu_count() or 1, len(paths) // worth_a_worker))
+    workers = max(1, min(MAX_WORKERS, processor_count(), len(paths) // worth_a_worker))
     answers: deque[Future[Sequence[tuple[Path, T]]]] = deque()
     with ThreadPoolExecutor(workers) as threads, examiners.start(workers) as started:
         # After an early exit, such as by Ctrl-C, the processes are ended first, without waiting for a file.
