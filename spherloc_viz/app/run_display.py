@@ -11,7 +11,7 @@ import viser
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis
-from spherloc.outcome import known_judgement
+from spherloc.outcome import Judgement, known_judgement
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
 from spherloc_viz.app.catalog import Run
@@ -26,7 +26,7 @@ from spherloc_viz.app.web.viser_internals import changes_of, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.layers.outcome import early_table
 from spherloc_viz.layers.point_cloud import cloud_items
-from spherloc_viz.layers.primitives import Label, Picture, SceneItem
+from spherloc_viz.layers.primitives import Label, Picture, SceneItem, Table
 from spherloc_viz.layers.selection import with_selection
 
 START_THEME = "dark"
@@ -102,6 +102,7 @@ class RunDisplay:
         """A run, what is withheld of it, the same without the truth if that is, and that without what came out."""
         self._around: tuple[MapScene, FloatArray, tuple[SceneItem, ...]] | None = None
         """A scene, how its map is turned, and its points and references."""
+        self._outcome: tuple[Trace, Judgement | None, Table] | None = None
         self._scene_of = places.scene_of
         self._theme = START_THEME
         self._redraw = places.redraw
@@ -190,7 +191,7 @@ class RunDisplay:
                 controls.draw(known, diagnosis, hidden)
             # The other views take the inliers from the colours of the picture before anything is hidden.
             told = replace(picture, step=drawn.step)
-            outcome = early_table(trace, known_judgement(known.trace))
+            outcome = self._outcome_of(trace, known_judgement(known.trace))
             offered = hidden_html(withheld, not presenter) if withheld else ""
             cause = str(diagnosis.cause) if last and diagnosis is not None and diagnosis.doubtful else ""
             self.panels.draw(blank if early else run, told, pause is not None, outcome, selected, early, offered, cause)
@@ -199,6 +200,12 @@ class RunDisplay:
             self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, early)
         self._client.flush()
         return self.canvas.check() if pause is None else pause
+
+    def _outcome_of(self, trace: Trace, judged: Judgement | None) -> Table:
+        """The table of the outcome, which is the same at all steps."""
+        if self._outcome is None or self._outcome[0] is not trace or self._outcome[1] is not judged:
+            self._outcome = trace, judged, early_table(trace, judged)
+        return self._outcome[2]
 
     def _cloud(self, run: Run, stage: str) -> tuple[SceneItem, ...]:
         """The points of the run's map and its references, with their names where the whole map is the subject."""

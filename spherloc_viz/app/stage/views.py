@@ -111,6 +111,10 @@ YAW_TURNS = np.array([yaw_rotation(turn).T for turn in TURNS_RAD])
 """The same as matrices (T, 3, 3) that turn rows."""
 
 
+ROUNDED = 1e-4
+"""How far a page's report may be from the place where its viewer was put, per coordinate."""
+
+
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
     """Position, target and field of view of the viewer."""
@@ -124,7 +128,7 @@ def stands_at(client: viser.ClientHandle, place: Viewpoint | tuple[float, float,
     """Whether the page reports that its viewer is in a view, or at a position; false if its report is not numbers."""
     camera = client.camera
     if not isinstance(place, Viewpoint):
-        return bool(np.allclose(camera.position, place))
+        return bool(np.abs(np.subtract(camera.position, place)).max() < ROUNDED)
     return same(Viewpoint(np.array(camera.position), np.array(camera.look_at), place.field_of_view_rad), place)
 
 

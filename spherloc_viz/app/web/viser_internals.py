@@ -11,13 +11,15 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
-from typing import Any, TypeVar
+from functools import cache
+from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 import viser
 import websockets.asyncio.server
 from aiohttp.http_exceptions import HttpProcessingError
 from viser import _messages
+from viser._assignable_props_api import AssignablePropsBase
 
 from spherloc.types import FloatArray
 from spherloc_viz.app.web.changes import Changes
@@ -84,10 +86,19 @@ def start_viser(key: str) -> viser.ViserServer:
     _disable_sharing(server)
     _wake_on_loop(server)
     keep_tracebacks_short()
+    _remember_types()
     server.get_event_loop().set_exception_handler(tell_in_short)
     # A page that leaves while it is being drawn is no news for the terminal.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
     return server
+
+
+def _remember_types() -> None:
+    """Look up the types of properties once for a kind of handle; viser does so for every handle, which takes longer
+    than all else about a node of the canvas."""
+    kinds = cache(get_type_hints)
+    handles: Any = AssignablePropsBase
+    handles._prop_hints = property(lambda handle: kinds(type(handle._impl.props)))
 
 
 def set_theme(gui: viser.GuiApi, theme: str) -> None:
@@ -176,7 +187,7 @@ def place_viewer(client: viser.ClientHandle, position: FloatArray, target: Float
     """
     camera = client.camera
     state = camera._state
-    if np.allclose([state.position, state.look_at], [position, target]):
+    if np.array_equal(state.position, position) and np.array_equal(state.look_at, target):
         return
     state.position, state.look_at = np.array(position, dtype=np.float64), np.array(target, dtype=np.float64)
     camera._update_wxyz()
