@@ -7,15 +7,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import viser
 
+from spherloc.datasets.map_scene import MapScene
+from spherloc.mapping.scene_files import UNITS_UNKNOWN, MapHead, scene_text
 from spherloc_viz.app.panels.open_panel import OpenedScene, OpenPanel, RecentScenes
 from spherloc_viz.app.panels.uploads import MAX_BYTES
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from tests.connected_page import ConnectedPage
+from tests.datasets.colmap_samples import EQUIRECTANGULAR, binary_files, sample_model, write
 from tests.waiting import until
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -48,6 +52,7 @@ class Visitor:
             self.touches,
             (folder, ROOT / "scenes"),
             self.opened.append,
+            lambda: self.opened[-1].path if self.opened else folder / "a.toml",
             RecentScenes(recent),
         )
         buttons = [widget for widget in client.gui._gui_input_handle_from_uuid.values()]
@@ -171,6 +176,34 @@ def test_folders_of_cameras_are_offered_as_one_map_unless_a_link_leads_out(visit
     for place in ("0:rig", "0:sub"):
         visitor.touch(f"map-folder:{place}")
         assert "not a folder of photographs" in visitor.said and visitor.panel._map._process is None
+
+
+def test_photographs_are_localized_in_the_map_at_hand(visitor: Visitor, folder: Path, rng: np.random.Generator) -> None:
+    """They become queries of a scene beside the map's own, which is opened."""
+    own, later = [f"seq/{k:03}.jpg" for k in range(4)], ["image_0.png", "image_1.png"]
+    for path in (*(folder / "home" / name for name in own), *(folder / "later" / name for name in later)):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), np.zeros((320, 640), np.uint8))
+    written = write(folder / "home_map" / "model", binary_files(sample_model(rng, models=(EQUIRECTANGULAR,))))
+    head = MapHead("home (units unknown)", "A map.", "../home", (UNITS_UNKNOWN,), ("", "[gravity]", "map = [0, 0, -1]"))
+    (written.parent / "scene.toml").write_text(scene_text(head, own))
+
+    visitor.touch("open-folder:0:0:later")
+    assert "localize-folder:0:later" not in visitor.rows, "no map is shown"
+    visitor.touch("open-scene:0:home_map/scene.toml")
+    assert visitor.said == ""
+    visitor.touch("open-folder:0:0:home")
+    assert "localize-folder:0:home" not in visitor.rows, "these are the map's own"
+    visitor.touch("open-folder:0:0:later")
+    assert "Localize these 2 photographs in the map of home" in visitor.panel._list.content
+    visitor.touch("localize-folder:0:later")
+    opened = visitor.opened[-1]
+    assert opened.path == folder / "home_map" / "later.toml" and opened.label == "later in home (units unknown)"
+    assert isinstance(opened.scene, MapScene)
+    assert [view.name for view in opened.scene.queries] == later
+    assert len(opened.scene.references) == 4 and not opened.scene.metric
+    visitor.touch("localize-folder:0:sub")
+    assert "has no images; give a folder with images" in visitor.said
 
 
 def test_names_of_files_are_escaped(visitor: Visitor) -> None:

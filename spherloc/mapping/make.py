@@ -15,6 +15,7 @@ from spherloc.mapping.later import place_rest
 from spherloc.mapping.photographs import NewImages
 from spherloc.mapping.positions import Positions, gps_of_images
 from spherloc.mapping.reconstruction import DATABASES, Reconstruction, reconstruct
+from spherloc.mapping.scene_files import SCENE
 from spherloc.mapping.upright import (
     GravityByLines,
     Level,
@@ -27,7 +28,7 @@ from spherloc.mapping.upright import (
     scale_by_height,
     scale_by_positions,
 )
-from spherloc.mapping.written import SCENE, Kept, Written, write_map
+from spherloc.mapping.written import Kept, Written, write_map
 
 GROUP = "group"
 """Name of the folder, with a number, of a map of images that could not be joined with the rest."""

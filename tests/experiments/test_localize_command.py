@@ -23,7 +23,7 @@ from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import SpherlocError
 from spherloc.experiments import read_results
-from spherloc.mapping.written import MODEL, SCENE
+from spherloc.mapping.scene_files import MODEL, SCENE
 from spherloc.trajectory import read_tum
 from spherloc.warm_up import warm_up
 from spherloc_viz.commands.bundled import all_scenes, one_kind

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from spherloc.mapping.advice import COMMAND, PAGE, for_a_page
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.make import ScaleMeasurement, make_map, scale_of
+from spherloc.mapping.new_queries import add_new_images, map_images
 from spherloc.mapping.photographs import (
     NewImages,
     Photographs,
@@ -33,8 +35,8 @@ from spherloc.mapping.photographs import (
     photographs,
     two_circles,
 )
+from spherloc.mapping.scene_files import _camera, _queries
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
-from spherloc.mapping.written import _camera, _queries
 from spherloc.problem import Problem
 from spherloc_viz.commands.map import _kind, _sizes, cameras_of_file, main, map_report, summary
 from tests.waiting import LIMIT_S
@@ -101,6 +103,26 @@ def test_its_scenes_open(walk):
     assert len(read_model(output / "model").images) == 5
     for view in (scene.queries[0], scene.references[0], new.queries[0]):  # the mask of the map is that of the scenes
         assert not view.usable_pixels()[-1].any() and view.usable_pixels()[200].all()
+
+
+def test_images_are_added_to_a_map_that_is_made(walk, tmp_path):
+    """The scene is the one that is written when the map is made with them."""
+    _, found, made, _, _, _ = walk
+    written, images = tomllib.loads(made.written.new_scene.read_text()), found.views[0].path.parent
+    for scene in (made.written.scene, made.written.new_scene):
+        assert add_new_images(scene, images) == (made.written.new_scene, ())
+        assert tomllib.loads(made.written.new_scene.read_text()) == written
+    assert map_images(made.written.scene).resolve() == images.resolve()
+    some = tmp_path / "some"
+    some.mkdir()
+    (some / "a.png").write_bytes(found.views[0].path.read_bytes())
+    (some / "b.png").write_bytes(b"no image")
+    path, remarks = add_new_images(made.written.new_scene, some)
+    assert path.name == "some.toml" and "1 of 2 images will be left out" in remarks[0]
+    new = load_scene(path)
+    assert [view.name for view in new.queries] == ["a.png"] and new.name == f"some in {images.name}"
+    with pytest.raises(InputError, match=r"campus_panorama\.toml: is not the scene of a map"):
+        add_new_images(bundled_scenes()["campus_panorama"], some)
 
 
 def test_what_is_done_is_not_done_again(walk):
@@ -279,6 +301,8 @@ def test_a_map_of_the_cameras_of_a_rig(rig, tmp_path):
     problem = scene.problem()
     assert isinstance(problem, Problem) and problem.truth_inliers.sum() > 30
     assert "of 2 cameras" in _kind(found.views)
+    path, _ = add_new_images(made.written.scene, folder)
+    assert {view.name for view in load_scene(path).queries} == set(poses)
 
 
 def test_a_job_tells_what_went_wrong_in_a_line(tmp_path, rng, capsys):

@@ -202,7 +202,7 @@ class Controls:
             self._sweep = SweepPanel(gui, touches, self._chosen_sweep, services.recorder)
         with tabs.add_tab("Open"):
             gui.add_html(heading_html("Other scenes, and matches of your own", "scene"))
-            self._open = OpenPanel(gui, client, touches, services.roots, self._open_scene)
+            self._open = OpenPanel(gui, client, touches, services.roots, self._open_scene, self._scene_file)
         with tabs.add_tab("Recordings"):
             gui.add_html(heading_html("Recorded runs, and a gallery of failures", "recording"))
             page = RecordingsPage(services.roots, self._enter, owner.open, owner.open_recorded, services.downloads)
@@ -324,6 +324,10 @@ class Controls:
             self._owner.changed()
         else:
             self._owner.step_history(-1 if button == UNDO else 1)
+
+    def _scene_file(self) -> Path:
+        """The file of the scene that the page shows."""
+        return self._catalog.path(self.scene.read().scene)
 
     def _open_scene(self, opened: OpenedScene) -> None:
         label = self._catalog.add(opened.scene, opened.path, opened.label)

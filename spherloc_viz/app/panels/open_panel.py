@@ -12,6 +12,7 @@ import viser
 from spherloc.datasets import Scene, bundled_scenes, load_scene
 from spherloc.disk_cache import cache_folder, store
 from spherloc.errors import InputError
+from spherloc.mapping.new_queries import add_new_images, map_images
 from spherloc.mapping.photographs import MIN_IMAGES
 from spherloc_viz.app.panels.folders import Listing, Roots, Row, describe
 from spherloc_viz.app.panels.map_panel import OUTPUT, MapPanel
@@ -30,15 +31,24 @@ MAX_NAMED = 3
 RULE = "border-top:1px solid rgba(128,140,160,.22)"
 
 
+NEW_ABOUT = "The first is localized at once; the strip below the scene has all of them."
+
+
 def list_html(
-    listing: Listing | None, roots: Sequence[Path], recent: Sequence[Row], bundled: Sequence[Row], remark: str
+    listing: Listing | None,
+    roots: Sequence[Path],
+    recent: Sequence[Row],
+    bundled: Sequence[Row],
+    remark: str,
+    in_map: str = "",
 ) -> str:
-    """A folder's content, or the folders that may be looked into; then recent and bundled scenes."""
+    """A folder's content, or the folders that may be looked into; then recent and bundled scenes. ``in_map`` is what
+    the map is called in which the folder's photographs can be localized; empty for none."""
     if listing is None:
         folders = [_row_html(f"open-folder:0:{k}:", f"{root.name}/", str(root)) for k, root in enumerate(roots)]
         parts = [_section("Folders", folders)]
     else:
-        parts = [_folder_html(listing)]
+        parts = [_folder_html(listing, in_map)]
     parts += [_section(title, [_scene_html(row) for row in rows]) for title, rows in _titled(recent, bundled)]
     return box("".join(parts), "font-size:12.5px") + (status_html(remark) if remark else "")
 
@@ -47,12 +57,15 @@ def _titled(recent: Sequence[Row], bundled: Sequence[Row]) -> list[tuple[str, Se
     return [(title, rows) for title, rows in (("Recent", recent), ("Bundled", bundled)) if rows]
 
 
-def _folder_html(listing: Listing) -> str:
+def _folder_html(listing: Listing, in_map: str) -> str:
     """Folder by folder; first the way up, last the other pages."""
     above = "open-folder:" if listing.parent is None else f"open-folder:0:{listing.parent}"
     rows = [_row_html(above, "↑ up" if listing.parent else "↑ all folders", "")]
     if title := _map_title(listing):
         rows.append(_row_html(f"map-folder:{listing.place}", title, MAP_ABOUT))
+    if in_map and (count := listing.photographs or sum(listing.in_folders.values())):
+        these = "this photograph" if count == 1 else f"these {count:,} photographs"
+        rows.append(_row_html(f"localize-folder:{listing.place}", f"Localize {these} in {in_map}", NEW_ABOUT))
     for row in listing.rows:
         if row.kind == "folder":
             rows.append(_row_html(f"open-folder:0:{row.place}", f"{row.name}/", ""))
@@ -168,10 +181,12 @@ class OpenPanel:
         touches: Touches,
         roots: Sequence[Path],
         open_scene: Callable[[OpenedScene], None],
+        at_hand: Callable[[], Path],
         recent: RecentScenes | None = None,
     ) -> None:
-        """``roots`` are the folders that may be looked into; ``open_scene`` is called on a thread of this panel."""
-        self._open_scene = open_scene
+        """``roots`` are the folders that may be looked into; ``open_scene`` is called on a thread of this panel, and
+        ``at_hand`` gives the file of the scene that the page shows."""
+        self._open_scene, self._at_hand = open_scene, at_hand
         self._roots, self._recent = Roots(roots), recent or RecentScenes()
         self._scratch = Scratch()
         self._background = BackgroundWorker(f"spherloc-open-{client.client_id}", self._complain)
@@ -189,6 +204,7 @@ class OpenPanel:
         touches.on("open-scene", lambda touch: self._background.ask(lambda: self._open(touch.argument)))
         touches.on("open-folder", self._walk)
         touches.on("map-folder", lambda touch: self._background.ask(lambda: self._make_map(touch.argument)))
+        touches.on("localize-folder", lambda touch: self._background.ask(lambda: self._localize(touch.argument)))
         self._background.ask(self._refresh)
 
     def close(self) -> None:
@@ -259,6 +275,26 @@ class OpenPanel:
         above = folder if self._roots.place(folder.parent) is None else folder.parent
         self._map.start(folder, above / f"{folder.name}{OUTPUT}")
 
+    def _localize(self, place: str) -> None:
+        """Open a scene of a folder's photographs in the map that the page shows; it is written beside the map's own."""
+        folder, scene = self._roots.find(place), self._at_hand()
+        if self._place(scene) is None:
+            raise InputError("the map that is shown is not in an allowed folder; open a map from the list first.")
+        self._say("Looking at the photographs …")
+        path, remarks = add_new_images(scene, folder)
+        self._open_file(path)
+        self._say(" ".join(remarks))
+
+    def _map_for(self, listing: Listing) -> str:
+        """The name of the map at hand, if other photographs than its own are listed; else empty."""
+        scene = self._at_hand()
+        try:
+            images = None if self._place(scene) is None else map_images(scene)
+            own = images is not None and images.resolve() == listing.folder.resolve()
+        except (InputError, OSError, RuntimeError):
+            return ""
+        return "" if images is None or own else f"the map of {images.name}"
+
     def _open(self, place: str) -> None:
         self._open_file(self._roots.find(place))
 
@@ -295,7 +331,8 @@ class OpenPanel:
         recent, remark = self._recent.read()
         if not self._bundled:
             self._bundled = self._described(bundled_scenes().values())
-        return list_html(listing, self._roots.folders, self._described(recent), self._bundled, remark)
+        in_map = "" if listing is None else self._map_for(listing)
+        return list_html(listing, self._roots.folders, self._described(recent), self._bundled, remark, in_map)
 
     def _described(self, paths: Iterable[Path]) -> list[Row]:
         """Those of the files that are there and allowed."""

@@ -1,0 +1,78 @@
+"""Other images in a map that is made already: writes a scene whose queries they are, beside that of the map."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from spherloc.datasets.scene_file import read_table, section
+from spherloc.errors import InputError, StoppedError, reason
+from spherloc.formats.colmap_files import read_model
+from spherloc.frontend.view import View
+from spherloc.mapping.photographs import Photographs, cameras_of, new_images_of, with_cameras
+from spherloc.mapping.scene_files import MODEL, UNITS_UNKNOWN, MapHead, toml_value, write_new_scene
+
+SECTIONS = ("gravity", "frontend", "masks")
+"""Sections of a scene file that are the same for all queries of a map."""
+
+
+def map_images(scene: Path) -> Path | None:
+    """The folder of the images of a map by one of its scene files; None if that is not a scene of a map made here.
+
+    Raises ``InputError`` for a file that is no scene file.
+    """
+    own = _map_of(read_table(scene))
+    return None if own is None or not (scene.parent / MODEL).is_dir() else scene.parent / own["images"]
+
+
+def _map_of(table: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The keys ``model`` and ``images`` of a map in its scene file; None where they are not those of ``written``."""
+    own = table if table.get("kind") == "colmap" else table.get("map")
+    if not isinstance(own, Mapping) or own.get("model") != MODEL or not isinstance(own.get("images"), str):
+        return None
+    return own
+
+
+def add_new_images(scene: Path, folder: Path) -> tuple[Path, tuple[str, ...]]:
+    """Write a scene file whose queries are the images in ``folder``, in the map of the scene file ``scene``.
+
+    Returns its path, and remarks on images that are left out. Raises ``InputError`` if ``scene`` is none of a map, if a
+    file of the map cannot be read, or if no image is of a camera of the map, and ``StoppedError`` if the file cannot be
+    written.
+    """
+    table, images = read_table(scene), map_images(scene)
+    own = _map_of(table)
+    if images is None or own is None:
+        raise InputError(f"{scene.name}: is not the scene of a map; open one that spherloc map made, or the page.")
+    mapped = _mapped(scene.parent / MODEL, images)
+    new_images, remarks = new_images_of(folder, mapped)
+    head = MapHead(
+        name=_name(table),
+        about=str(table.get("about", "")),
+        images=own["images"],
+        units=(UNITS_UNKNOWN,) if table.get("units") == "unknown" else (),
+        sections=tuple(line for name in SECTIONS for line in _section(table, name, str(scene))),
+    )
+    try:
+        return write_new_scene(head, scene.parent, new_images, mapped.views[0].camera), remarks
+    except OSError as error:
+        raise StoppedError(
+            f"{scene.parent}: cannot be written ({reason(error)}); make room there or allow it."
+        ) from None
+
+
+def _name(table: Mapping[str, Any]) -> str:
+    """The name of the map; scenes of other images have that of their folder in front."""
+    name, others = str(table.get("name", "")), Path(str(table.get("images", ""))).name
+    return name.removeprefix(f"{others} in ") if "map" in table else name
+
+
+def _mapped(model_folder: Path, images: Path) -> Photographs:
+    """The images of the map with their cameras; where it has several, as the folder of the images tells them."""
+    model = read_model(model_folder)
+    views = tuple(View(one.name, model.camera(one.camera_id), images / one.name) for one in model.images.values())
+    return with_cameras(images, {}) if len(cameras_of(views)) > 1 else Photographs(views, (), {})
+
+
+def _section(table: Mapping[str, Any], name: str, where: str) -> list[str]:
+    values = section(table, name, where)
+    return ["", f"[{name}]", *(f"{key} = {toml_value(value)}" for key, value in values.items())] if values else []

@@ -1,0 +1,125 @@
+"""The scene files of a map: of its own images, and of others that are to be localized in it."""
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from spherloc.cameras.base import Camera
+from spherloc.frontend.view import View
+from spherloc.mapping.photographs import NewImages, cameras_of
+
+MODEL = "model"
+"""Folder of COLMAP's model in that of the map."""
+SCENE = "scene.toml"
+"""Scene file of the map's own images."""
+UNITS_UNKNOWN = 'units = "unknown"             # lengths are told in units of the map'
+EVERY = 4
+"""Every fourth image of the map is a query of the scene file, localized against the others."""
+
+
+@dataclass(frozen=True)
+class MapHead:
+    """What the scene files of a map have in common, as lines of TOML."""
+
+    name: str
+    """Name of the map that users see."""
+    about: str
+    images: str
+    """Folder of the map's images, relative to the scene files."""
+    units: tuple[str, ...]
+    """The line that says that the unit is unknown, if it is."""
+    sections: tuple[str, ...]
+    """The sections [gravity], [frontend] and [masks]."""
+
+
+def scene_text(head: MapHead, names: Sequence[str]) -> str:
+    """The scene whose queries are some of the map's own images, of which ``names`` are all."""
+    lines = [
+        'kind = "colmap"',
+        f"name = {toml_text(head.name)}",
+        f"about = {toml_text(head.about)}",
+        f"model = {toml_text(MODEL)}",
+        f"images = {toml_text(head.images)}",
+        *head.units,
+        "# Localized against the other images; those of the map that you name here are left out of it.",
+        f"queries = {_names(names[EVERY - 1 :: EVERY] or names[-1:])}",
+        *head.sections,
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def new_scene_text(head: MapHead, folder: Path, new_images: NewImages, camera: Camera) -> str:
+    """The scene of images that are to be localized in the map in ``folder``; ``camera`` is theirs where ``new_images``
+    do not say."""
+    lines = [
+        'kind = "image-folder"',
+        f"name = {toml_text(f'{new_images.folder.resolve().name} in {head.name}')}",
+        f"about = {toml_text(head.about)}",
+        f"images = {toml_text(relative(new_images.folder, folder))}",
+        *head.units,
+        *_queries(new_images.views or (), camera),
+        "",
+        "[map]",
+        f"model = {toml_text(MODEL)}",
+        f"images = {toml_text(head.images)}",
+        *head.sections,
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _queries(views: Sequence[View], camera: Camera) -> list[str]:
+    """The queries and their cameras; without views, all images of the folder are queries of the one camera."""
+    if not views:
+        return ["", "[camera]", *_camera(camera)]
+    lines = [f"queries = {_names([view.name for view in views])}"]
+    names: dict[str, list[str]] = {}
+    for view in views:
+        names.setdefault(repr(view.camera), []).append(view.name)
+    cameras = cameras_of(views)
+    if len(cameras) == 1:
+        return [*lines, "", "[camera]", *_camera(views[0].camera)]
+    for key, own in names.items():
+        lines += ["", "[[cameras]]", f"images = {_names(own)}", "[cameras.camera]", *_camera(cameras[key])]
+    return lines
+
+
+def _names(names: Sequence[str]) -> str:
+    return json.dumps(names, ensure_ascii=False)
+
+
+def _camera(camera: Camera) -> list[str]:
+    return [f"{key} = {toml_value(value)}" for key, value in camera.to_dict().items()]
+
+
+def write_new_scene(head: MapHead, folder: Path, new_images: NewImages, camera: Camera) -> Path:
+    """Write the file of ``new_scene_text``; returns its path. Raises ``OSError``."""
+    path = folder / f"{_file_name(new_images.folder)}.toml"
+    path.write_text(new_scene_text(head, folder, new_images, camera), encoding="utf-8")
+    return path
+
+
+def _file_name(new_images: Path) -> str:
+    """What the scene file of new images is called: as their folder, so that several folders have one each."""
+    name = new_images.resolve().name
+    return f"new_{name}" if f"{name}.toml" == SCENE else name
+
+
+def relative(path: Path, folder: Path) -> str:
+    """A path relative to the folder, so that both can be moved together; absolute on another drive."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:
+        return path.resolve().as_posix()
+
+
+def toml_text(value: str) -> str:
+    """A TOML basic string: JSON's strings are those."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+def toml_value(value: Any) -> str:
+    """A text, number, list or switch in TOML."""
+    return toml_text(value) if isinstance(value, str) else json.dumps(value)
