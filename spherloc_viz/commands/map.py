@@ -461,7 +461,8 @@ def main(folder: Path, output: Path) -> int:
         except OSError as error:
             _tell({"error": _unwritten(report, error)})
             return 1
-        told = [*found.remarks, *summary(made, found), f"report        {report}"]
+        others = "other images  open their folder in the list: they can be localized in this map"
+        told = [*found.remarks, *summary(made, found), f"report        {report}", others]
     _tell({"scene": str(made.written.scene), "summary": told})
     return 0
 

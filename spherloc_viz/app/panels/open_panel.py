@@ -31,7 +31,7 @@ MAX_NAMED = 3
 RULE = "border-top:1px solid rgba(128,140,160,.22)"
 
 
-NEW_ABOUT = "The first is localized at once; the strip below the scene has all of them."
+NEW_ABOUT = "The first is localized at once; the others are under Sequence in the tab Play."
 
 
 def list_html(
@@ -61,11 +61,11 @@ def _folder_html(listing: Listing, in_map: str) -> str:
     """Folder by folder; first the way up, last the other pages."""
     above = "open-folder:" if listing.parent is None else f"open-folder:0:{listing.parent}"
     rows = [_row_html(above, "↑ up" if listing.parent else "↑ all folders", "")]
-    if title := _map_title(listing):
-        rows.append(_row_html(f"map-folder:{listing.place}", title, MAP_ABOUT))
     if in_map and (count := listing.photographs or sum(listing.in_folders.values())):
         these = "this photograph" if count == 1 else f"these {count:,} photographs"
         rows.append(_row_html(f"localize-folder:{listing.place}", f"Localize {these} in {in_map}", NEW_ABOUT))
+    if title := _map_title(listing):
+        rows.append(_row_html(f"map-folder:{listing.place}", title, MAP_ABOUT))
     for row in listing.rows:
         if row.kind == "folder":
             rows.append(_row_html(f"open-folder:0:{row.place}", f"{row.name}/", ""))
