@@ -10,7 +10,7 @@ from spherloc.frontend.masks import around
 from spherloc.mapping.carried import BELOW_DEG, carried_nadir_deg
 from spherloc.mapping.make import ScaleMeasurement, make_map
 from spherloc.mapping.photographs import photographs
-from spherloc_viz.commands.map import summary
+from spherloc_viz.commands.map_report import summary
 from tests.frontend.pictures import texture
 from tests.frontend.textured_rooms import FISHEYE, room_view, standing, wallpaper
 from tests.needs import real_data

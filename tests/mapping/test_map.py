@@ -38,7 +38,8 @@ from spherloc.mapping.photographs import (
 from spherloc.mapping.scene_files import _camera, _queries
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
 from spherloc.problem import Problem
-from spherloc_viz.commands.map import _kind, _sizes, cameras_of_file, main, map_report, summary
+from spherloc_viz.commands.map import _kind, _sizes, cameras_of_file, main
+from spherloc_viz.commands.map_report import map_report, summary
 from tests.waiting import LIMIT_S
 
 IMAGES = ("reference_002", "reference_003", "reference_004", "reference_005", "reference_006")

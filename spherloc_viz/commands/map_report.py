@@ -1,0 +1,275 @@
+"""What there is to say of a map: a summary in lines, and a report as a page that needs no other files."""
+
+import base64
+import html
+import io
+from collections.abc import Collection, Mapping
+
+import cv2
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from spherloc.cameras.base import Camera
+from spherloc.errors import InputError
+from spherloc.frontend import trained
+from spherloc.frontend.view import View
+from spherloc.geometry import camera_centre
+from spherloc.mapping.advice import advice
+from spherloc.mapping.make import Map
+from spherloc.mapping.pairs import MIN_MATCHES
+from spherloc.mapping.photographs import Photographs, cameras_of
+from spherloc.types import FloatArray
+
+MAP_FEATURES = {
+    "sift": "SIFT",
+    "aliked": "ALIKED, matched by LightGlue",
+    "sift+aliked": "SIFT, and ALIKED matched by LightGlue",
+}
+"""Kinds of features and what they are called. "sift" is what is taken by itself, though ALIKED be installed: LightGlue
+takes seconds a pair (``python -m benchmarks.features``)."""
+
+
+def summary(made: Map, found: Photographs) -> list[str]:
+    """The result in lines of text."""
+    written = made.written
+    placed = {name for one in (made, *made.groups) for name in one.written.poses}
+    missing = [view.name for view in found.views if view.name not in placed]
+    lines = [
+        f"in the map    {len(written.poses)} of {len(found.views)} images, {len(written.points):,} points, "
+        f"{written.error_px:.2f} px mean error",
+        f"down          from {made.level.source}; single images differ by {made.level.spread_deg:.1f}° (median)",
+        *_about_lines(made),
+        f"features      {about_features(made)}",
+        f"scale         {made.scale.source or _units_unknown(made)}",
+    ]
+    if made.carried_deg:
+        lines.append(f"masked        {_carried_words(made.carried_deg)}")
+    if missing:
+        lines.append(f"left out      {', '.join(missing[:5])}{', …' if len(missing) > 5 else ''}: see the report")
+    for group in made.groups:
+        lines.append(f"on its own    {len(group.written.poses)} images that could not be joined: {group.written.scene}")
+    if made.made.contradictions:
+        first, second = made.made.contradictions[0]
+        lines.append(
+            f"in doubt      {len(made.made.contradictions)} pairs of images see each other and hardly match (such as "
+            f"{first}, {second}): places that look alike may have been taken for one"
+        )
+    if far := made.scale.misplaced:
+        lines.append(f"in doubt      {_far_words(far)}")
+    return lines
+
+
+def about_features(made: Map) -> str:
+    """A sentence on the features that were used, and on others that could be used."""
+    if made.features != "sift":
+        return MAP_FEATURES[made.features]
+    more = advice("more features")
+    return f"SIFT{more}" if trained.installed() or not more else f"SIFT{more}, with the extra 'learned'"
+
+
+def _units_unknown(made: Map) -> str:
+    return f"units unknown; {made.scale.why_unknown or advice('any scale')}"
+
+
+def _about_lines(made: Map) -> list[str]:
+    """A line on the photographs whose lines gave no gravity; none if all did."""
+    without = made.lines.why_not
+    if not without:
+        return []
+    name, why = next(iter(without.items()))
+    count = f"{len(without)} of {len(without) + len(made.lines.found)} images"
+    return [f"no gravity    from the lines of {count} (see the report), such as {name}: {why}"]
+
+
+def _carried_words(degrees: float) -> str:
+    return (
+        f"{degrees:g}° around straight down, where all images show the same: what carries the camera{advice('carried')}"
+    )
+
+
+def _far_words(far: Mapping[str, float]) -> str:
+    told = ", ".join(f"{name} {off:.2f} m" for name, off in list(far.items())[:5])
+    more = f" and {len(far) - 5} more" if len(far) > 5 else ""
+    return f"far from the given positions: {told}{more}; the map is wrong there, or the position is"
+
+
+THUMBNAIL_PX = 240
+MAX_THUMBNAILS = 40
+MAX_NAMED = 30
+"""Largest number of images whose names stand in the picture from above."""
+MAX_POINTS = 20_000
+CLOSE = 0.15
+"""If the images lie within this share of the picture, a second one shows them alone."""
+WITHIN = 0.98
+"""Share of the points that the picture shows: a few far points would make the others too small."""
+
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #1b1f24; }
+table { border-collapse: collapse; } td, th { padding: .2rem .8rem .2rem 0; text-align: left; vertical-align: top; }
+td.number { text-align: right; } img { max-width: 100%; } .out { color: #a11; }
+"""
+
+
+def map_report(made: Map, found: Photographs) -> str:
+    """The report as a page that needs no other files."""
+    written, views = made.written, found.views
+    names = [view.name for view in views]
+    scale = made.scale.source or "unknown: ten units are the usual distance of a point to an image"
+    if made.scale.why_unknown:
+        scale += f" ({made.scale.why_unknown.rstrip('.')})"
+    facts = {
+        "Images in the map": f"{len(written.poses)} of {len(views)}",
+        "Points": f"{len(written.points):,}",
+        "Mean reprojection error": f"{written.error_px:.2f} px",
+        "Down": f"from {made.level.source}; single images differ from it by {made.level.spread_deg:.1f}° in the median",
+        "Features": MAP_FEATURES[made.features],
+        **({"Masked": _carried_words(made.carried_deg)} if made.carried_deg else {}),
+        "Scale": scale,
+    }
+    rows = [_row(made, names, index) for index in range(len(views))]
+    left = [view for view in views if view.name not in written.poses]
+    above = _from_above(made, cameras_of(views).values(), "metres" if made.scale.source else "units")
+    return "\n".join(
+        [
+            '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Map</title>',
+            f"<style>{STYLE}</style></head><body><h1>Map of {len(written.poses)} images</h1>",
+            "<table>",
+            *(f"<tr><th>{key}</th><td>{html.escape(value)}</td></tr>" for key, value in facts.items()),
+            "</table>",
+            *(f"<p>{html.escape(remark)}</p>" for remark in found.remarks),
+            *_doubts(made),
+            "<h2>From above</h2>",
+            f'<img alt="Points and cameras of the map from above" src="{above}">',
+            "<h2>Not in the map</h2>" if left else "",
+            *(_thumbnail(view, made, names) for view in left[:MAX_THUMBNAILS]),
+            "<h2>Images</h2><table><tr><th>image</th><th>in the map</th><th>best partner</th><th>matches</th>"
+            "<th>gravity from its lines</th>"
+            f"{'<th>off its position</th>' if made.scale.off_m else ''}</tr>",
+            *rows,
+            "</table></body></html>",
+        ]
+    )
+
+
+def _doubts(made: Map) -> list[str]:
+    against, far = made.made.contradictions, made.scale.misplaced
+    said = [f'<p class="out">Images {html.escape(_far_words(far))}.</p>'] if far else []
+    if not against:
+        return said
+    pairs = "; ".join(f"{first} and {second}" for first, second in against[:10])
+    return [
+        *said,
+        '<p class="out">These images lie side by side in the map, in sight of each other, and hardly match. The map '
+        "may take two places that look alike for one: "
+        f"{html.escape(pairs)}{' …' if len(against) > 10 else ''}</p>",
+    ]
+
+
+def _row(made: Map, names: list[str], index: int) -> str:
+    name, counts = names[index], made.made.matches[index]
+    best = int(counts.argmax())
+    inside = name in made.written.poses
+    cells = [
+        f"<td>{html.escape(name)}</td>",
+        f"<td{'' if inside else ' class=out'}>{'yes' if inside else 'no'}</td>",
+        f"<td>{html.escape(names[best] if counts[best] else 'none')}</td>",
+        f'<td class="number">{counts[best]:,}</td>',
+        f"<td>{html.escape(_lines_of(made, name))}</td>",
+        _off(made, name),
+    ]
+    return f"<tr>{''.join(cells)}</tr>"
+
+
+def _lines_of(made: Map, name: str) -> str:
+    """What the lines of an image tell of gravity: its bound, or why they tell nothing."""
+    if name in made.lines.why_not:
+        return f"none: {made.lines.why_not[name]}"
+    return f"within {np.degrees(made.lines.found[name].bound_rad or 0.0):.1f}°"
+
+
+def _off(made: Map, name: str) -> str:
+    """A cell with the distance of an image to the position that was given for it."""
+    if not made.scale.off_m:
+        return ""
+    off_m = made.scale.off_m.get(name)
+    return f'<td class="number">{"" if off_m is None else f"{off_m:.2f} m"}</td>'
+
+
+def why_not(made: Map, names: list[str], index: int) -> str:
+    """Why an image is not in the map, in a sentence."""
+    counts = made.made.matches[index]
+    inside = np.array([name in made.written.poses for name in names])
+    group = next((group for group in made.groups if names[index] in group.written.poses), None)
+    if group is not None:
+        return (
+            f"It is one of {len(group.written.poses)} images that fit together, but not with the map: take some in "
+            f"between. They are a map of their own, {group.written.scene.parent.name}."
+        )
+    if names[index] in made.level.leaning:
+        return (
+            f"COLMAP placed it so that it leans {made.level.leaning[names[index]]:.1f}° against the map, at a place "
+            "that looks like the right one: take more images around it."
+        )
+    if counts.max() < MIN_MATCHES:
+        return f"No other image has {MIN_MATCHES} matches with it that fit together: take images closer to it."
+    best = int(np.where(inside, counts, -1).argmax())
+    if counts[best] < MIN_MATCHES:
+        other = int(counts.argmax())
+        return (
+            f"It has {counts[other]:,} matches with {names[other]}, which is not in the map either, and no image of "
+            f"the map has {MIN_MATCHES} matches with it that fit together: take images in between."
+        )
+    return (
+        f"It has {counts[best]} matches with {names[best]}, too few of which have a point in the map: take "
+        "one more image near it."
+    )
+
+
+def _thumbnail(view: View, made: Map, names: list[str]) -> str:
+    reason = html.escape(f"{view.name}: {why_not(made, names, names.index(view.name))}")
+    try:
+        pixels = view.read()
+    except InputError:
+        return f"<p>{reason}</p>"
+    scale = THUMBNAIL_PX / pixels.shape[1]
+    _, content = cv2.imencode(".jpg", cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+    return f'<p><img alt="" src="{_data("jpeg", content.tobytes())}"><br>{reason}</p>'
+
+
+def _from_above(made: Map, cameras: Collection[Camera], unit: str) -> str:
+    """Address of a PNG."""
+    points = made.written.points
+    centres = np.stack([camera_centre(pose) for pose in made.written.poses.values()])
+    shown = points[_near(points, centres)]
+    shown = shown[:: max(1, len(shown) // MAX_POINTS)]
+    extent = float(np.ptp(centres[:, :2], axis=0).max())
+    close = 0.0 < extent < CLOSE * float(np.ptp(shown[:, :2], axis=0).max(initial=0.0))
+    figure = Figure(figsize=(14 if close else 9, 6.5), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot(1, 2 if close else 1, 1, aspect="equal", adjustable="datalim")
+    axes.scatter(shown[:, 0], shown[:, 1], s=1.5, c="#8fa3b8", linewidths=0)
+    if close:
+        axes.scatter(centres[:, 0], centres[:, 1], s=28, c="#c0392b", zorder=3)
+        axes.set(xlabel=unit, ylabel=unit)
+        axes = figure.add_subplot(1, 2, 2, aspect="equal", adjustable="datalim", title="the cameras alone")
+    if len(cameras) == 1:  # those of several do not follow each other by their names
+        axes.plot(centres[:, 0], centres[:, 1], color="#d08a1c", linewidth=0.8)
+    axes.scatter(centres[:, 0], centres[:, 1], s=28, c="#c0392b", zorder=3)
+    if len(centres) <= MAX_NAMED:
+        for name, centre in zip(made.written.poses, centres, strict=True):
+            axes.text(centre[0], centre[1], f"  {name}", fontsize=8, va="center", parse_math=False, clip_on=True)
+    axes.set(xlabel=unit, ylabel=unit)
+    axes.margins(0.2)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", metadata={"Software": None})
+    return _data("png", file.getvalue())
+
+
+def _near(points: FloatArray, centres: FloatArray) -> np.ndarray:
+    away = np.linalg.norm(points - np.median(centres, axis=0), axis=1)
+    return away <= np.quantile(away, WITHIN) if len(points) else np.zeros(0, bool)
+
+
+def _data(kind: str, content: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
