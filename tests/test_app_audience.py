@@ -103,7 +103,8 @@ def test_an_audience_follows_the_presenter_each_with_a_state_of_its_own(house: H
     # What the presenter hides, the audience cannot see; what its own switch hides, nobody else misses.
     until(lambda: "off the truth" in other._display.panels.steps._text.content)
     presenter_page.set(presenter._controls.display._hide, True)
-    until(lambda: "The truth is unknown" in other._display.panels.steps._text.content)
+    until(lambda: "withheld until" in other._display.panels.steps._text.content)
+    until(lambda: "tiny" not in other._status._line.content and "The presenter shows mc" in other._status._line.content)
     presenter_page.set(presenter._controls.display._hide, False)
     until(lambda: "off the truth" in other._display.panels.steps._text.content)
     house.sessions.notice("A recording was deleted.")

@@ -59,7 +59,7 @@ def test_what_is_written_is_read_again(place: Place) -> None:
     options = replace(default_options("ransac-2p", place.catalog.problem(scene)), iterations=77, confidence=0.97)
     viewpoint = (1.5, -2.25, 3.0, 0.0, 0.125, -1e-05, 45.0)
     request = RunRequest(scene, "ransac-2p", options)
-    view = PageView("sample-3", (2, 4), "light", True, viewpoint, "Graph", compared=("mc", "ransac-2p"))
+    view = PageView("sample-3", (2, 4), "light", "outcome", viewpoint, "Graph", compared=("mc", "ransac-2p"))
     view = replace(view, table=TableLook("outliers", "px", down=True), graph="list")
     found = place.follower.follow(place.link(request, view), place.now, VIEW)
     assert (found.request, found.view, found.remarks) == (request, view, ())

@@ -108,12 +108,11 @@ class Audience:
             if shown is None:
                 self._status.say(WAITING)
                 return None
-            request = shown.run.request
-            self._status.say(
-                f"The presenter shows {request.scene.scene}, {request.estimator}, seed {request.scene.seed}."
-            )
+            request, withheld = shown.run.request, shown.withheld
+            how = f"{request.estimator}, seed {request.scene.seed}."
+            self._status.hide_answers(bool(withheld | self._display.withheld(shown.run)))
+            self._status.say(f"The presenter shows {request.scene.scene}, {how}", untold=f"The presenter shows {how}")
             selected = self._edits.places(shown.run.kept)
-            withheld = shown.withheld
             return self._display.draw(shown.run, shown.mesh, shown.diagnosis, selected, asked, now, withheld)
         except Exception as error:
             self._status.fail(error)

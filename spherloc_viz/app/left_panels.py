@@ -93,18 +93,18 @@ class LeftPanels:
         cause: str = "",
     ) -> None:
         """Show a step of a run, in the views that are to be seen. ``selected`` are numbers in the problem; ``hidden``
-        says that the outcome is not to be told yet: then the run is without its pose and its inliers. ``offered`` is
-        HTML that says which answers are hidden, and ``cause`` what is wrong with the run, at its last step."""
+        says that what came out is not to be told: then run and picture are without it. ``offered`` is HTML that says
+        which answers are hidden, and ``cause`` what is wrong with the run, at its last step."""
         kept: NDArray = run.kept
         tables = [table for table in picture.tables if table.name != outcome.name]
-        self.steps.show(picture.step, playing, tables, hidden)
+        self.steps.show(picture.step, playing, tables)
         seen = self._seen
         if "Yaw" in seen:
-            of_yaw = picture.charts if picture.step.key.startswith("yaw-") else ()
+            of_yaw = picture.charts if hidden or picture.step.key.startswith("yaw-") else ()
             chart = next((chart for chart in of_yaw if chart.name == "yaw"), None)
             self._yaw.draw(run.trace, picture.step.key, selected, kept, hidden, chart)
         if "Graph" in seen:
-            self.graph.draw(picture.graph, graph_begins(run.trace), selected, kept)
+            self.graph.draw(picture.graph, graph_begins(run.trace), selected, kept, hidden)
         if "Charts" in seen:
             self._charts.draw(picture.charts)
         if "Residuals" in seen:

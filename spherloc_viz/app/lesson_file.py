@@ -23,7 +23,6 @@ from spherloc_viz.app.matches import match_drawing as drawing
 from spherloc_viz.app.matches.image_panel import image_sizes, match_colors, photo_uri
 from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.review.opened import Opened
-from spherloc_viz.app.run_display import without_truth
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.flat_picture import svg
 from spherloc_viz.app.stage.still_page import Still, scene_script, scripts_in, with_policy
@@ -32,6 +31,7 @@ from spherloc_viz.app.web.page import QUIET, client_html
 from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.layers.matches import match_view
 from spherloc_viz.layers.primitives import Picture
+from spherloc_viz.layers.withheld import OUTCOME, untold, withheld_by
 from spherloc_viz.lessons import lessons
 from spherloc_viz.lessons.html import (
     Form,
@@ -209,11 +209,12 @@ def numbers_text(linked: LinkedRun) -> dict[str, str]:
 def still_of(linked: LinkedRun, runs: LinkedRuns, dark: bool) -> Still:
     """The canvas of a link, as the playground shows it."""
     run, view = linked.run, linked.view
-    trace = without_truth(run.trace) if view.answers_hidden else run.trace
+    withheld = withheld_by(view.answers)
+    trace = untold(run.trace, withheld) if withheld else run.trace
     timeline = steps(trace)
     index = find_step(timeline, view.step)
-    picture = paint(trace, index)
-    if index == len(timeline) - 1 and not view.answers_hidden:
+    picture = paint(trace, index, OUTCOME not in withheld)
+    if index == len(timeline) - 1 and not withheld:
         alternative = diagnose(trace).alternative_cam_from_map
         if alternative is not None:
             picture = with_alternative(picture, trace, alternative)

@@ -24,6 +24,7 @@ from spherloc_viz.app.matches.match_table import NEW_TABLE, TableLook, look_of
 from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.plots.graph_view import LOOKS
 from spherloc_viz.app.review.opened import Opened
+from spherloc_viz.layers.withheld import HIDDEN, ONLY_OUTCOME, TOLD
 from spherloc_viz.options import option_fields, typed, usable_estimators
 
 VERSION = 1
@@ -32,7 +33,7 @@ MAX_LETTERS = 15_000
 MAX_M, MIN_M = 1e7, 1e-6
 """Largest coordinate of a viewer, and least distance between a viewer and the point that it looks at."""
 THEMES = ("dark", "light")
-ANSWERS = ("told", "hidden")
+ANSWERS = (TOLD, HIDDEN, ONLY_OUTCOME)
 TABS = ("step's", "Yaw", "Graph", "Charts", "Residuals", "Images", "Matches")
 """The tabs of the lower left panel, after the word for the one that goes with the step."""
 SCENE_KEYS = ("scene", "case", "place")
@@ -56,7 +57,8 @@ class PageView:
     selected: tuple[int, ...]
     """Numbers of the selected matches, as they are where nothing is hidden."""
     theme: str
-    answers_hidden: bool = False
+    answers: str = ANSWERS[0]
+    """Which answers are told, one of ``ANSWERS``."""
     viewpoint: tuple[float, ...] = ()
     """The viewer's position (3), target (3), and field of view, degrees; empty for the step's own view."""
     tab: str = TABS[0]
@@ -99,7 +101,7 @@ def link_of(
         ("view", ",".join(f"{number:.6g}" for number in view.viewpoint)),
         ("tab", view.tab if view.tab != TABS[0] else None),
         ("theme", view.theme if view.theme != THEMES[0] else None),
-        ("answers", ANSWERS[1] if view.answers_hidden else None),
+        ("answers", view.answers if view.answers != ANSWERS[0] else None),
         ("compare", ",".join(view.compared)),
         ("table", view.table.text()),
         ("graph", view.graph if view.graph != LOOKS[0] else None),
@@ -291,7 +293,7 @@ def _read(text: str, remarks: list[str]) -> dict[str, Any]:
 def _view(said: dict[str, Any], view: PageView, opened: Opened | None, remarks: list[str]) -> PageView:
     """The view that a link asks for; a recording without a step opens at its key step."""
     theme = _one_of(said, "theme", THEMES, remarks)
-    hidden = _one_of(said, "answers", ANSWERS, remarks) == ANSWERS[1]
+    answers = _one_of(said, "answers", ANSWERS, remarks)
     selected: tuple[int, ...] = ()
     viewpoint: tuple[float, ...] = ()
     try:
@@ -311,7 +313,7 @@ def _view(said: dict[str, Any], view: PageView, opened: Opened | None, remarks: 
         remarks.append(str(error))
     graph = _one_of(said, "graph", LOOKS, remarks)
     compared = _compared(said.get("compare", ""), remarks)
-    return PageView(step, selected, theme, hidden, viewpoint, tab, compared, table, graph)
+    return PageView(step, selected, theme, answers, viewpoint, tab, compared, table, graph)
 
 
 def _compared(text: str, remarks: list[str]) -> tuple[str, ...]:

@@ -107,6 +107,12 @@ class PageRuns:
         waiting = self._recorder.overload
         return f"Recording as {submitted.path.name} …{f' {waiting}' if waiting else ''}", LOOK_S
 
+    def untold(self, sentence: str) -> str:
+        """A sentence of ``finish`` without the name of the file: it begins with the problem's, which may tell how many
+        matches are wrong."""
+        name = "" if self._submitted is None else self._submitted.path.name
+        return sentence.replace(f" as {name}", "").replace(name, "a recording") if name else sentence
+
     def keepable(self, trace: Trace) -> str:
         """The file of a run's recording, if pages made it; else empty."""
         known, path = self._known, self.path(trace)

@@ -28,12 +28,9 @@ from spherloc_viz.layers.outcome import early_table
 from spherloc_viz.layers.point_cloud import cloud_items
 from spherloc_viz.layers.primitives import Label, Picture, SceneItem, Table
 from spherloc_viz.layers.selection import with_selection
+from spherloc_viz.layers.withheld import ANSWERS, OUTCOME, untold
 
 START_THEME = "dark"
-ANSWERS = frozenset({"outcome", "truth"})
-"""What may be hidden: what came out, until the last step, and the true pose with all that follows from it."""
-
-
 NAMED_AT = frozenset({"Matches", "Outcome"})
 """Stages at whose steps references have their names in the canvas: elsewhere these cover what the step is about."""
 
@@ -98,8 +95,8 @@ class RunDisplay:
         """The scene that is being opened: label, scene and mesh."""
         self._revealed: tuple[Run | None, int, frozenset[str]] = None, 0, frozenset()
         """A run, how often answers had been hidden or shown, and which were then asked for although hidden."""
-        self._blind: tuple[Run, frozenset[str], Run, Run] | None = None
-        """A run, what is withheld of it, the same without the truth if that is, and that without what came out."""
+        self._blind: tuple[Run, frozenset[str], Run] | None = None
+        """A run, what is withheld of it, and the same without that."""
         self._around: tuple[MapScene, FloatArray, tuple[SceneItem, ...]] | None = None
         """A scene, how its map is turned, and its points and references."""
         self._outcome: tuple[Trace, Judgement | None, Table] | None = None
@@ -110,7 +107,7 @@ class RunDisplay:
 
     def withheld(self, run: Run) -> frozenset[str]:
         """Which of ``ANSWERS`` this page hides of a run."""
-        return ANSWERS - self._told(run) if self.controls.display.answers_hidden else frozenset()
+        return self.controls.display.withheld - self._told(run)
 
     def _told(self, run: Run) -> frozenset[str]:
         """Which answers of a run the user asked for since answers were hidden."""
@@ -159,20 +156,16 @@ class RunDisplay:
         """
         controls, known = self.controls, run
         withheld = presenter | self.withheld(run)
-        blank = run
-        if withheld:
-            run, blank = self._untold(run, withheld)
+        hidden, told = bool(withheld), OUTCOME not in withheld
+        run = self._untold(run, withheld)
         trace = run.trace
-        timeline = steps(trace)
+        timeline = steps(trace, told)
         at_hand = self._shown[2].step.stage if self._shown is not None else ""
         balls = controls.display.wanted_view == "Balls" and at_hand != "Translation"
         if balls and any(step.key == BALLS_STEP for step in timeline):
             self.panels.steps.go(BALLS_STEP)
         index, pause = self.panels.steps.advance(timeline, asked)
-        picture, last = paint(trace, index), index == len(timeline) - 1
-        early = "outcome" in withheld and not last
-        withheld -= {"outcome"} if last else frozenset()
-        hidden = bool(withheld)  # at the last step with the truth shown, nothing is
+        picture, last = paint(trace, index, told), index == len(timeline) - 1
         diagnosis = None if hidden else diagnosis
         alternative = None if diagnosis is None else diagnosis.alternative_cam_from_map
         if last and alternative is not None:
@@ -190,14 +183,14 @@ class RunDisplay:
                     self.canvas.draw(run, drawn, mesh, controls.camera_movable)
                 controls.draw(known, diagnosis, hidden)
             # The other views take the inliers from the colours of the picture before anything is hidden.
-            told = replace(picture, step=drawn.step)
+            plain = replace(picture, step=drawn.step)
             outcome = self._outcome_of(trace, known_judgement(known.trace))
             offered = hidden_html(withheld, not presenter) if withheld else ""
             cause = str(diagnosis.cause) if last and diagnosis is not None and diagnosis.doubtful else ""
-            self.panels.draw(blank if early else run, told, pause is not None, outcome, selected, early, offered, cause)
+            self.panels.draw(run, plain, pause is not None, outcome, selected, not told, offered, cause)
             waiting = "" if hidden else status_html("Diagnosing …")
             self.panels.diagnose(waiting if diagnosis is None else diagnosis_html(diagnosis, whole=last))
-            self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, early)
+            self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, not told)
         self._client.flush()
         return self.canvas.check() if pause is None else pause
 
@@ -217,13 +210,13 @@ class RunDisplay:
         items = self._around[2]
         return items if stage in NAMED_AT else tuple(item for item in items if not isinstance(item, Label))
 
-    def _untold(self, run: Run, withheld: frozenset[str]) -> tuple[Run, Run]:
-        """The run without the truth, if that is withheld, and also without what came out."""
+    def _untold(self, run: Run, withheld: frozenset[str]) -> Run:
+        """The run without what is withheld of it."""
+        if not withheld:
+            return run
         if self._blind is None or self._blind[0] is not run or self._blind[1] != withheld:
-            trace = without_truth(run.trace) if "truth" in withheld else run.trace
-            blank = replace(trace, cam_from_map=None, inlier_mask=np.zeros_like(trace.inlier_mask))
-            self._blind = run, withheld, replace(run, trace=trace), replace(run, trace=blank)
-        return self._blind[2:]
+            self._blind = run, withheld, replace(run, trace=untold(run.trace, withheld))
+        return self._blind[2]
 
     @property
     def step_key(self) -> str:
@@ -237,12 +230,13 @@ class RunDisplay:
         (run, mesh, picture), display = self._shown, self.controls.display
         trace, layers = run.trace, display.layers()
         words, facts = summary_of(trace)
-        outcome = "" if self.withheld(run) else f" · {words.capitalize()} · {' · '.join(facts)}"
+        hidden = bool(self.withheld(run))
+        outcome = "" if hidden else f" · {words.capitalize()} · {' · '.join(facts)}"
         return Shown(
             trace=trace,
             items=tuple(item for item in picture.scene if item.layer in layers),
             backdrop=mesh if "mesh" in layers else None,
-            title=trace.problem.name,
+            title=f"{len(trace.problem)} matches" if hidden else trace.problem.name,
             note=f"{picture.step.title} · {trace.estimator}, seed {trace.seed}{outcome}",
             recorded=recorded,
             dark=display.theme == "dark",
@@ -253,8 +247,3 @@ class RunDisplay:
         if theme != self._theme:
             self._theme = theme
             set_theme(self._client.gui, theme)
-
-
-def without_truth(trace: Trace) -> Trace:
-    """The run with its true pose and true labels removed."""
-    return replace(trace, problem=replace(trace.problem, truth_cam_from_map=None, truth_inliers=None))

@@ -43,6 +43,7 @@ from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks, is_linked, update_widget
 from spherloc_viz.app.workers import Job, LatestWorker
 from spherloc_viz.layers import steps
+from spherloc_viz.layers.withheld import TOLD
 from spherloc_viz.lessons.numbers import number_text, numbers_of
 
 QUIET_S = 0.7
@@ -281,6 +282,7 @@ class Session:
         arrived = True
         try:
             followed = self._follower.follow(link, self._shown_request(), self._view())
+            self._hide_first(followed, number)
             if followed.request is not None:
                 self._asked.append((number, followed.request))
             pause = self._solve_request()
@@ -296,6 +298,12 @@ class Session:
             else:  # the run was ended for a newer change, and is made again with it
                 self._links.extendleft(reversed(links))
 
+    def _hide_first(self, followed: Followed, number: int) -> None:
+        """What a link hides is hidden before its run is there, which else would be seen with it."""
+        if followed.request is not None and followed.view.answers != TOLD:
+            with self._changes.as_of(number):
+                self._controls.display.answers = followed.view.answers
+
     def _shown_request(self) -> RunRequest:
         """The request of the run at hand; before there is one, what the page begins with."""
         if self._run is not None:
@@ -308,7 +316,7 @@ class Session:
         if followed.request is not None:
             with self._changes.as_of(number):
                 self._controls.display.theme = followed.view.theme
-                self._controls.display.answers_hidden = followed.view.answers_hidden
+                self._controls.display.answers = followed.view.answers
         if followed.request is not None and self._run is not None:
             kept = set(self._run.kept.tolist())
             self._edits.select(set(followed.view.selected) & kept)
@@ -333,7 +341,7 @@ class Session:
             self._display.step_key,
             selected,
             display.theme,
-            display.answers_hidden,
+            display.answers,
             self._display.canvas.viewpoint(),
             self._display.panels.tab,
             () if run is None else self._controls.compare.compared(run.trace),
@@ -438,7 +446,7 @@ class Session:
         withheld = self._display.withheld(run)
         self._services.presented.show(run, self._mesh(run), self._diagnosis(run), withheld)
         sentence, pause = self._runs.finish(run, self._diagnosis(run))
-        self._status.say(sentence, self._runs.keepable(run.trace))
+        self._status.say(sentence, self._runs.keepable(run.trace), self._runs.untold(sentence))
         return pause
 
     def record(self, trace: Trace, scene: SceneRequest) -> None:
@@ -464,7 +472,9 @@ class Session:
             self._display.draw_map()
             return None
         diagnosis = self._diagnosis(run)
-        self._services.presented.hide(run, self._display.withheld(run))
+        withheld = self._display.withheld(run)
+        self._services.presented.hide(run, withheld)
+        self._status.hide_answers(bool(withheld))
         pause = self._display.draw(run, self._mesh(run), diagnosis, self._edits.places(run.kept), asked, answers)
         self._arrived = followed
         if self._in_lesson:

@@ -23,11 +23,23 @@ class Status:
         self._complaint: tuple[str, viser.NotificationHandle] | None = None
         self._lasting = False
         self._lock = threading.Lock()
+        self._said: tuple[str, str] = "", ""
+        """What is shown, as HTML, and what is shown in its place while answers are hidden."""
+        self._hidden = False
 
-    def say(self, sentence: str, keep: str = "") -> None:
-        """Show what the page is doing; ``keep`` is the file of a recording that gets a button to keep it."""
-        html = _line_html(sentence, keep=keep)
-        update_widget(self._line, content=html)
+    def say(self, sentence: str, keep: str = "", untold: str = "") -> None:
+        """Show what the page is doing; ``keep`` is the file of a recording that gets a button to keep it, and
+        ``untold`` the sentence while answers are hidden, if the other one tells of them."""
+        with self._lock:
+            self._said = _line_html(sentence, keep=keep), _line_html(untold or sentence, keep=keep)
+            update_widget(self._line, content=self._said[self._hidden])
+
+    def hide_answers(self, hidden: bool) -> None:
+        """Hide the answers in what is said, or show them again."""
+        with self._lock:
+            before, self._hidden = self._said[self._hidden], hidden
+            if self._line.content == before:  # and no complaint
+                update_widget(self._line, content=self._said[hidden])
 
     def complain(self, sentence: str, lasting: bool = False) -> None:
         """Show one sentence about what went wrong; the page keeps its last run and stays usable. A ``lasting`` one is

@@ -19,7 +19,7 @@ from spherloc_viz.layers.primitives import Step, Table
 DIM = "opacity:.65"
 OPTIONS = {"bound_px": "Bound (px)", "noise_px": "Noise of an inlier (px)", "gravity_sd_deg": "Gravity sd (deg)"}
 """What the settings call options that advice names as code does."""
-WITHHELD = "Answers are hidden. This part would show them: switch Hide answers off to see it."
+WITHHELD = "Answers are hidden, and this part would tell them. It is shown once they are revealed."
 WORDS = {
     **{"success": style.INLIER, "failure": style.OUTLIER, "no pose": style.OUTLIER, UNKNOWABLE: style.OUTLIER},
     **{str(Outcome.LOCALIZED): style.INLIER, str(Outcome.DOUBTFUL): style.CLIQUE},

@@ -27,6 +27,7 @@ from spherloc_viz.layers import (
     refinement,
     start,
     translation,
+    withheld,
     yaw,
 )
 from spherloc_viz.layers.frame import Plan, RunView, focus_of
@@ -59,9 +60,13 @@ class _Timeline:
 
     graphs: dict[Callable[[], Graph], Graph | None] = field(default_factory=dict)
 
-    def graph(self, index: int) -> Graph | None:
+    def _until(self, index: int, told: bool) -> list[Plan]:
+        """The steps up to one, without those that tell what came out unless that is ``told``."""
+        return [plan for plan in self.plans[: index + 1] if told or plan.untold is not None]
+
+    def graph(self, index: int, told: bool) -> Graph | None:
         """The graph as of a step, made once; None where that fails on the numbers of an extension."""
-        draw = next((plan.graph for plan in reversed(self.plans[: index + 1]) if plan.graph is not None), None)
+        draw = next((plan.graph for plan in reversed(self._until(index, told)) if plan.graph is not None), None)
         if draw is None:
             return None
         if draw not in self.graphs:
@@ -73,10 +78,10 @@ class _Timeline:
                 self.graphs[draw] = None
         return self.graphs[draw]
 
-    def charts_at(self, index: int) -> tuple[Chart, ...]:
+    def charts_at(self, index: int, told: bool) -> tuple[Chart, ...]:
         """The charts as of a step."""
         named: dict[str, Callable[[], Chart]] = {}
-        for plan in self.plans[: index + 1]:
+        for plan in self._until(index, told):
             named.update(plan.charts)
         return tuple(chart for chart in map(self.chart, named.values()) if chart is not None)
 
@@ -122,9 +127,13 @@ def _planned(view: RunView) -> _Timeline:
     return _Timeline(view, tuple(plan for _, plan in named), headings)
 
 
-def steps(trace: Trace) -> tuple[StepHeading, ...]:
-    """The headings of a run's steps, from the matches to the outcome. Captions are made when a step is painted."""
-    return _timeline(trace).headings
+def steps(trace: Trace, told: bool = True) -> tuple[StepHeading, ...]:
+    """The headings of a run's steps, from the matches to the outcome. Captions are made when a step is painted.
+
+    Unless what came out is to be ``told``, steps that tell it have the names of their stages as titles.
+    """
+    timeline = _timeline(trace)
+    return timeline.headings if told else withheld.untold_headings(timeline.plans, timeline.headings)
 
 
 def graph_begins(trace: Trace) -> str:
@@ -132,14 +141,23 @@ def graph_begins(trace: Trace) -> str:
     return next((plan.key for plan in _timeline(trace).plans if plan.graph is not None), "")
 
 
-def paint(trace: Trace, index: int) -> Picture:
-    """The picture of the step at ``index``. Charts of earlier steps are kept."""
+def paint(trace: Trace, index: int, told: bool = True) -> Picture:
+    """The picture of the step at ``index``. Charts of earlier steps are kept.
+
+    Unless what came out is to be ``told``, a step that tells it has the picture of the last one before it that does
+    not; ``trace`` is then to be without it too (``withheld.untold``).
+    """
     timeline = _timeline(trace)
-    heading, frame = timeline.headings[index], timeline.plans[index].draw()
+    shown = index if told else withheld.last_untold(timeline.plans, index)
+    plan, heading = timeline.plans[shown], timeline.headings[shown]
+    frame = plan.draw() if told or plan.untold is None else plan.untold()
     step = Step(heading.key, heading.title, frame.caption, frame.equation, frame.note, heading.stage)
+    if shown != index:
+        step = withheld.untold_step(timeline.headings[index], heading)
+    tables = frame.tables if shown == index else ()
     scene = base_items(timeline.view, frame) + frame.items
-    focus = focus_of(timeline.view, frame)
-    return Picture(step, scene, frame.tables, focus, partial(timeline.charts_at, index), partial(timeline.graph, index))
+    charts, graph = partial(timeline.charts_at, shown, told), partial(timeline.graph, shown, told)
+    return Picture(step, scene, tables, focus_of(timeline.view, frame), charts, graph)
 
 
 def with_alternative(picture: Picture, trace: Trace, cam_from_map: FloatArray) -> Picture:

@@ -112,7 +112,14 @@ def guarded_plans(view: RunView, stage: Stage, plans: Callable[[], list[Plan]]) 
         found = plans()
     except Exception as error:  # the numbers of others
         return [_sentence_step(view, stage, _failure(stage, error))]
-    return [replace(plan, draw=_guarded(view, stage, plan)) for plan in found]
+    return [
+        replace(
+            plan,
+            draw=_guarded(view, stage, plan.draw),
+            untold=None if plan.untold is None else _guarded(view, stage, plan.untold),
+        )
+        for plan in found
+    ]
 
 
 def _sentence_step(view: RunView, stage: Stage, sentence: str) -> Plan:
@@ -120,10 +127,10 @@ def _sentence_step(view: RunView, stage: Stage, sentence: str) -> Plan:
     return Plan(f"stage-{shorten(str(stage.kind))}", "Not drawn", lambda: _said(view, sentence))
 
 
-def _guarded(view: RunView, stage: Stage, plan: Plan) -> Callable[[], Frame]:
+def _guarded(view: RunView, stage: Stage, drawn: Callable[[], Frame]) -> Callable[[], Frame]:
     def draw() -> Frame:
         try:
-            return whole_frame(plan.draw(), len(view.points))
+            return whole_frame(drawn(), len(view.points))
         except Exception as error:
             return _said(view, _failure(stage, error))
 
@@ -161,8 +168,9 @@ def whole_plans(found: Any, kind: str) -> list[Plan]:
         if not isinstance(key, str) or not key.startswith(kind) or keys.count(key) > 1:
             raise InputError(f"the key {show(key)} of a plan does not begin with {show(kind)}, or another one has it")
     for plan in found:
-        if not isinstance(plan.title, str) or not callable(plan.draw) or not isinstance(plan.charts, Mapping):
-            raise InputError(f"the plan {show(plan.key)} has a title, draw or charts of a wrong type")
+        draws = callable(plan.draw) and (plan.untold is None or callable(plan.untold))
+        if not isinstance(plan.title, str) or not draws or not isinstance(plan.charts, Mapping):
+            raise InputError(f"the plan {show(plan.key)} has a title, draw, untold or charts of a wrong type")
     return found
 
 

@@ -69,6 +69,9 @@ class Plan:
     """Charts by name. They stay until a later step has one of the same name."""
     graph: Callable[[], Graph] | None = None
     """Makes the graph as the step shows it. It is kept until a later step has one."""
+    untold: Callable[[], Frame] | None = None
+    """Draws the step so that neither this nor its title, charts and graph tell what came out of the run; None if they
+    do, so that the step is not shown while answers are hidden."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,8 @@ def plans(view: RunView, stage: RansacStage) -> list[Plan]:
     """Steps for the number of samples by Eq. 28, every improvement, and a comparison with Eq. 28."""
     count = len(stage.improved_at)
     shown = even(np.arange(count), MAX_IMPROVEMENTS).tolist()
-    out = [Plan("samples-needed", "How many samples it takes", lambda: _needed(view, stage))]
+    needed = partial(_needed, view, stage)
+    out = [Plan("samples-needed", "How many samples it takes", needed, untold=partial(needed, told=False))]
     for k in shown:
         title, charts = _title(stage, k), {"ransac": partial(chart, stage, k)}
         if count <= MAX_IN_TWO:
@@ -46,14 +47,15 @@ def _size(stage: RansacStage) -> int:
     return stage.samples.shape[1]
 
 
-def _needed(view: RunView, stage: RansacStage) -> Frame:
+def _needed(view: RunView, stage: RansacStage, told: bool = True) -> Frame:
+    """How many samples it takes by Eq. 28; if ``told``, also how many the run drew, which its inliers may decide."""
     size = _size(stage)
     rows = tuple((f"{100 * share:.0f} %", f"{_samples_for(share, size):,}") for share in SHARES)
     half, tenth = _samples_for(0.5, size), _samples_for(0.1, size)
     return Frame(
         f"A sample of {size} matches gives a right pose only if all {size} are right, so with half of them right "
-        f"{half:,} samples hold a clean one with 99 % probability, and with a tenth {tenth:,}. "
-        f"This run drew {stage.iterations:,} samples from {len(view.points)} matches.",
+        f"{half:,} samples hold a clean one with 99 % probability, and with a tenth {tenth:,}."
+        + (f" This run drew {stage.iterations:,} samples from {len(view.points)} matches." if told else ""),
         f"k = log(1 − P) / log(1 − wⁿ),  n = {size},  P = 0.99   (Eq. 28)",
         view.standing(np.eye(3)),
         view.colors(style.UNDECIDED),

@@ -1,5 +1,8 @@
 """The steps before any estimate: the matches, their bearings on the unit sphere, and the unknowns that remain."""
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 
 from spherloc.cameras.base import model_name
@@ -12,14 +15,16 @@ from spherloc_viz.layers.primitives import Focus, Label, SceneItem, Segments
 
 
 def plans(view: RunView) -> list[Plan]:
-    """Steps for the problem, the bearings, one match, gravity, and the four unknowns."""
-    return [
-        Plan("problem", "The matches", lambda: _problem(view)),
-        Plan("bearings", "Bearings on the unit sphere", lambda: _bearings(view)),
-        Plan("match", "One match is one ray", lambda: _match(view)),
-        Plan("gravity", "What gravity gives", lambda: _gravity(view)),
-        Plan("unknowns", "What gravity leaves open", lambda: _unknowns(view)),
-    ]
+    """Steps for the problem, the bearings, one match, gravity, and the four unknowns. None of them tells what came
+    out."""
+    drawn: tuple[tuple[str, str, Callable[[RunView], Frame]], ...] = (
+        ("problem", "The matches", _problem),
+        ("bearings", "Bearings on the unit sphere", _bearings),
+        ("match", "One match is one ray", _match),
+        ("gravity", "What gravity gives", _gravity),
+        ("unknowns", "What gravity leaves open", _unknowns),
+    )
+    return [Plan(key, title, partial(draw, view), untold=partial(draw, view)) for key, title, draw in drawn]
 
 
 def _lost(problem: Problem) -> int:

@@ -71,9 +71,11 @@ class StageArcs:
 
     @cached_property
     def example(self) -> IntArray:
-        """The arcs of one pair with an arc over the estimated yaw: of such pairs, with two arcs if there are any, the
-        one whose arc there is closest to ``EXAMPLE_RAD`` in width."""
+        """The arcs of one pair with an arc over the estimated yaw, or of any pair if that is withheld: of such pairs,
+        with two arcs if there are any, the one whose arc there is closest to ``EXAMPLE_RAD`` in width."""
         arcs, same = self.stage.clique.astype(np.int64), self._continues
+        if not len(arcs):
+            arcs = np.arange(len(self))
         several = same[arcs] | np.append(same[1:], False)[arcs]
         if several.any():
             arcs = arcs[several]
@@ -283,14 +285,17 @@ REACH = 40
 def plans(view: RunView, stage: YawStage) -> list[Plan]:
     """Steps for one pair with its arcs, more and more arcs, candidate yaws, and the largest overlap."""
     arcs = StageArcs(stage)
+    pair, roots, every = partial(_pair, view, arcs), partial(_roots, view, arcs), partial(_all, view, arcs)
     out = [
-        Plan("yaw-pair", "One pair of matches", lambda: _pair(view, arcs), _chart_of(view, arcs, "yaw-pair")),
-        Plan("yaw-roots", "The two roots of a pair", lambda: _roots(view, arcs), _chart_of(view, arcs, "yaw-roots")),
+        Plan("yaw-pair", "One pair of matches", pair, _chart_of(view, arcs, "yaw-pair"), untold=pair),
+        Plan("yaw-roots", "The two roots of a pair", roots, _chart_of(view, arcs, "yaw-roots"), untold=roots),
     ]
     for size in growing(len(arcs), *SIZES):
-        key = f"{GROWING}{size}"
-        out.append(Plan(key, f"{size:,} arcs", partial(_some, view, arcs, size), _chart_of(view, arcs, key)))
-    out.append(Plan("yaw-arcs", "Yaw arcs of all pairs", lambda: _all(view, arcs), {"yaw": lambda: chart(view, stage)}))
+        key, some = f"{GROWING}{size}", partial(_some, view, arcs, size)
+        charts = _chart_of(view, arcs, key)
+        out.append(Plan(key, f"{size:,} arcs", some, charts, untold=partial(some, told=False)))
+    charts = {"yaw": lambda: chart(view, stage)}
+    out.append(Plan("yaw-arcs", "Yaw arcs of all pairs", every, charts, untold=every))
     places = candidate_yaws(stage)
     for number, place in enumerate(places, 1):
         yaw = ring.degrees_of(place + 0.5, len(stage.overlap))
@@ -336,8 +341,8 @@ def candidate_yaws(stage: YawStage) -> IntArray:
     return np.sort(highest[np.minimum(gaps, places - gaps) > REACH][:MAX_CANDIDATES])
 
 
-def _some(view: RunView, arcs: StageArcs, size: int) -> Frame:
-    """The first arcs of those that are spread over all pairs."""
+def _some(view: RunView, arcs: StageArcs, size: int, told: bool = True) -> Frame:
+    """The first arcs of those that are spread over all pairs; if ``told``, where most of them overlap."""
     chosen, start = arcs.spread(size), view.standing(np.eye(3))
     found = arcs.overlap_of(chosen)
     drawn = chosen[: style.MAX_DRAWN_ARCS]
@@ -346,10 +351,11 @@ def _some(view: RunView, arcs: StageArcs, size: int) -> Frame:
         note += f" {len(drawn)} of these {size:,} are drawn."
     most, off = len(found.clique), ring.off_truth(view, found.yaw_rad)
     meet = "no two overlap" if most == 1 else f"at most {most:,} overlap, at {np.degrees(found.yaw_rad):.2f}°{off}"
+    count = f" = {most:,}" if told else ""
     return Frame(
-        f"With {size:,} of {len(arcs):,} arcs on the ring, {meet}. "
+        f"With {size:,} of {len(arcs):,} arcs on the ring, {meet if told else 'the outline counts those at each yaw'}. "
         "Arcs of wrong pairs lie anywhere; of two right matches, one arc holds the true yaw.",
-        f"max over θ of Σ 1(|f(θ)| ≤ τ) = {most:,}   (Eq. 34)",
+        f"max over θ of Σ 1(|f(θ)| ≤ τ){count}   (Eq. 34)",
         start,
         view.colors(style.UNDECIDED),
         view.no_matches(),

@@ -37,6 +37,7 @@ from spherloc_viz.app.web.viser_internals import at_once, put
 from spherloc_viz.app.workers import LatestWorker
 from spherloc_viz.layers.primitives import SceneItem
 from spherloc_viz.layers.scene import trajectory_items
+from spherloc_viz.layers.withheld import HIDDEN, ONLY_OUTCOME, TOLD, withheld_by
 from spherloc_viz.recording.replay import Reopened
 
 PROJECTOR = (
@@ -55,11 +56,13 @@ class DisplayControls:
         self._wanted: str | None = None
         self.times_hidden = 0
         """How often the answers were hidden or shown."""
+        self._outcome_told = False
+        """Whether of hidden answers the outcome is told all the same, as links can ask for."""
         self._views = gui.add_button_group("View", views.NAMES)
         self._dark = gui.add_checkbox("Dark", True, hint="Dark for a screen, light for a projector and for print.")
         gui.add_html(PROJECTOR)
         self._hide = gui.add_checkbox(
-            "Hide answers", False, hint="No truth and no comparison, and no outcome before the last step."
+            "Hide answers", False, hint="No truth, no outcome and no comparison, until each is asked for."
         )
         with gui.add_folder("Layers", expand_by_default=False):
             self._follow = gui.add_checkbox("Follow steps", True, hint="Move to where the step's subject reads best.")
@@ -79,13 +82,20 @@ class DisplayControls:
         put(self._dark, theme == "dark")
 
     @property
-    def answers_hidden(self) -> bool:
-        """Whether the truth and, before the last step, the outcome are hidden."""
-        return self._hide.value
+    def answers(self) -> str:
+        """Which answers are told: one of the words of ``layers.withheld``."""
+        hidden = ONLY_OUTCOME if self._outcome_told else HIDDEN
+        return hidden if self._hide.value else TOLD
 
-    @answers_hidden.setter
-    def answers_hidden(self, hidden: bool) -> None:
-        put(self._hide, hidden)
+    @answers.setter
+    def answers(self, word: str) -> None:
+        put(self._hide, word != TOLD)
+        self._outcome_told = word == ONLY_OUTCOME
+
+    @property
+    def withheld(self) -> frozenset[str]:
+        """The answers that are hidden, of all runs."""
+        return withheld_by(self.answers)
 
     @property
     def follow(self) -> bool:
@@ -109,6 +119,7 @@ class DisplayControls:
     @at_once
     def _hide_or_show(self, event: viser.GuiEvent) -> None:
         self.times_hidden += 1
+        self._outcome_told = False
         self._changed(event)
 
     @at_once
@@ -264,12 +275,12 @@ class Controls:
     def draw(self, run: Run, diagnosis: Diagnosis | None, hidden: bool) -> None:
         """Show what belongs to the newest run; ``diagnosis`` is None until it is ready; ``hidden`` hides answers."""
         self._follow_preset(run.request, hidden)
-        html = _changes_html(run)
+        html = _changes_html(run, hidden)
         if self._edits.content != html:
             self._edits.content, self._edits.visible = html, bool(html)
         self.compare.draw(run.trace, hidden)
         self.review.draw(run, diagnosis, hidden)
-        for part in (self._sweep, self.sequence, self._recordings):
+        for part in (self._sweep, self.sequence, self._recordings, self._export):
             part.hide_answers(hidden)
 
     def show_how_to_repeat(self, run: Run) -> None:
@@ -377,17 +388,19 @@ DONE = {"spoiled": "made wrong", "mended": "made right", "hidden": "hidden"}
 """What was done to single matches, by the field of a variation, in words."""
 
 
-def _changes_html(run: Run) -> str:
-    """What is not as the scene's name says, and what was done to single matches; empty if nothing was."""
+def _changes_html(run: Run, hidden: bool) -> str:
+    """What is not as the scene's name says, and what was done to single matches; empty if nothing was. ``hidden`` says
+    only that something was done."""
     variation, parts = run.request.scene.variation, []
     label, name = run.request.scene.scene, run.trace.problem.name.removesuffix(", edited")
-    if not name.startswith(label) and not label.startswith(name):
+    if not hidden and not name.startswith(label) and not label.startswith(name):
         parts.append(f"Changed: {escape(name)}")
     done = [f"{len(getattr(variation, name))} {words}" for name, words in DONE.items() if getattr(variation, name)]
     if done:
         links = [("unedit:", "take back")] + [("unhide:", "show hidden")] * bool(variation.hidden)
         ways = " · ".join(f'<u data-touch="{action}" role="button" tabindex="0">{words}</u>' for action, words in links)
-        parts.append(f"Matches by hand: {', '.join(done)}. {ways}")
+        what = "Matches were changed by hand" if hidden else f"Matches by hand: {', '.join(done)}"
+        parts.append(f"{what}. {ways}")
     return box("".join(f"<div>{part}</div>" for part in parts), "font-size:12px") if parts else ""
 
 

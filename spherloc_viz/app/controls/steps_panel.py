@@ -89,10 +89,9 @@ class StepsPanel:
         short = stages.count(stage) >= LONG_STAGE and stages[self._index + 1 : self._index + 2] == [stage]
         return PLAY_S * (SHORT if short else 1.0) / PACES[self._pace.value]
 
-    def show(self, step: Step, playing: bool, tables: Sequence[Table], hidden: bool = False) -> None:
-        """Put the step at hand, as it was painted, and its tables on the page; ``hidden`` calls the steps that are to
-        come by their stage, since their titles tell what will be found."""
-        titles = titles_of(self._steps, self._index if hidden else len(self._steps))
+    def show(self, step: Step, playing: bool, tables: Sequence[Table]) -> None:
+        """Put the step at hand, as it was painted, and its tables on the page."""
+        titles = titles_of(self._steps)
         if self._choice.options != titles:
             self._choice.options = titles
             self._slider.max = max(2, len(titles))
@@ -154,10 +153,9 @@ class StepsPanel:
         self._changed(None)
 
 
-def titles_of(steps: Sequence[StepHeading], told: int) -> tuple[str, ...]:
-    """What the steps are called in the list; those after the one of index ``told`` by their stage."""
-    names = (step.title if k <= told else step.stage for k, step in enumerate(steps))
-    return tuple(f"{k}/{len(steps)}  {name}" for k, name in enumerate(names, 1))
+def titles_of(steps: Sequence[StepHeading]) -> tuple[str, ...]:
+    """What the steps are called in the list."""
+    return tuple(f"{k}/{len(steps)}  {step.title}" for k, step in enumerate(steps, 1))
 
 
 def moved(steps: Sequence[StepHeading], index: int, move: str) -> int:

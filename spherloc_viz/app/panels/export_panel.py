@@ -17,7 +17,7 @@ from spherloc.errors import InputError
 from spherloc.trace import Trace
 from spherloc_viz.app.glossary import heading_html
 from spherloc_viz.app.stage.still_page import Still, still_html, viewpoint
-from spherloc_viz.app.text import DIM, begun, box, status_html
+from spherloc_viz.app.text import DIM, WITHHELD, begun, box, status_html
 from spherloc_viz.app.workers import BackgroundWorker
 from spherloc_viz.layers.primitives import SceneItem
 
@@ -68,6 +68,7 @@ class ExportPanel:
         self._client, self._shown = client, shown
         self._background = BackgroundWorker(f"spherloc-export-{client.client_id}", self._complain)
         self._code: tuple[str, str] | None = None
+        self._hidden = False
         gui.add_html(f'<div data-view="{VIEW}"></div>')
         gui.add_html(heading_html("Send what you see, or repeat it elsewhere", "recording"))
         gui.add_html(LINK)
@@ -85,6 +86,19 @@ class ExportPanel:
         """Show the code that repeats the run at hand."""
         if self._code != (python, command):
             self._code = (python, command)
+            self._show()
+
+    def hide_answers(self, hidden: bool) -> None:
+        """Hide the code, whose scene and settings tell how many matches are wrong, or show it again."""
+        if self._hidden != hidden:
+            self._hidden = hidden
+            self._show()
+
+    def _show(self) -> None:
+        if self._hidden:
+            self._text.content = status_html(WITHHELD)
+        elif self._code is not None:
+            python, command = self._code
             self._text.content = (
                 code_html("Python", python)
                 + code_html("Command", command)

@@ -124,7 +124,7 @@ class RecordingsPanel:
         self._show()
 
     def hide_answers(self, hidden: bool) -> None:
-        """Tell no more of the runs than what they are of, or tell all again."""
+        """Tell no more of the runs than how they were made, or tell all again."""
         if hidden != self._untold:
             self._untold = hidden
             if self._runs is not None:
@@ -195,7 +195,7 @@ class RecordingsPanel:
         while self._kept:
             file = self._kept.popleft()
             self._library.relabel(file, [KEPT], [], None)
-            self._say(f"Kept {file}, with the label “{KEPT}”.")
+            self._say(f"Kept{'' if self._untold else f' {file}'}, with the label “{KEPT}”.")
             self._stored(self._library.row(file))
 
     def open_linked(self, file: str) -> Opened:

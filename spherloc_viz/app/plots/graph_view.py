@@ -15,7 +15,7 @@ from spherloc_viz.app.glossary import help_html, linked
 from spherloc_viz.app.paging import PAGE, chip, page_of
 from spherloc_viz.app.plots import shapes
 from spherloc_viz.app.plots.ball_list import PAGES, ball_list_html, selected_rows
-from spherloc_viz.app.text import box
+from spherloc_viz.app.text import WITHHELD, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers.frame import even
@@ -242,18 +242,27 @@ class GraphView:
         touches.on(LOOK, self._choose)
         touches.on(PAGES, self._turn)
 
-    def draw(self, graph: Graph | None, begins: str, selected: tuple[int, ...], kept: NDArray[np.int64]) -> None:
+    def draw(
+        self,
+        graph: Graph | None,
+        begins: str,
+        selected: tuple[int, ...],
+        kept: NDArray[np.int64],
+        hidden: bool = False,
+    ) -> None:
         """Show the graph as far as it is known at this step; before the step with the key ``begins``, a link to that
-        step.
+        step or, if what came out is ``hidden``, that the graph would tell it.
 
         ``selected`` are indices in the problem, ``kept`` (N,) the numbers of the matches on the page. Sends nothing if
         nothing changed.
         """
-        drawn = (graph, begins, selected, kept.tobytes(), self.look, self._page)
+        drawn = (graph, begins, selected, kept.tobytes(), self.look, hidden, self._page)
         if self._drawn is not None and self._drawn[0] is graph and self._drawn[1:] == drawn[1:]:
             return
         self._graph = graph
-        if graph is None:
+        if graph is None and hidden and begins:
+            content = status_html(WITHHELD)
+        elif graph is None:
             content = _waiting_html(begins)
         elif graph.list_balls is not None and self.look == LIST:
             content = self._list_html(graph, graph.list_balls(), selected, kept)

@@ -16,7 +16,7 @@ from spherloc_viz.app.glossary import help_html
 from spherloc_viz.app.plots import shapes
 from spherloc_viz.app.plots.charts import curve_parts
 from spherloc_viz.app.plots.shapes import MINUS, Scale, round_ticks, tick_texts, wrapped_deg
-from spherloc_viz.app.text import box
+from spherloc_viz.app.text import WITHHELD, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import at_once, update_widget
 from spherloc_viz.layers.primitives import Chart, Curve
@@ -274,7 +274,7 @@ def _tips(bars: ArcBars) -> list[str]:
 
 
 NO_ARCS = PairArcs(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0), "")
-UNTOLD = "Answers are hidden: poses that were tried, the estimate, and which arcs are of right matches are told later."
+UNTOLD = "Answers are hidden: the estimate, and which arcs are of right matches, are told once they are revealed."
 PEAK, WHOLE = "Zoom to the peak", "All yaws"
 MIN_DRAG = 0.012
 """Share of the plot that a press must cross to count as a drag."""
@@ -308,9 +308,9 @@ class YawView:
     ) -> None:
         """Show a run, at a step, with the pairs of the ``selected`` matches (indices in the problem) highlighted.
 
-        ``kept`` (N,) are the numbers of the matches on the page. ``hidden`` leaves out the results. ``step_chart`` is
-        the chart of the yaw as of a step about yaws, whose curve then takes the place of the run's. Sends nothing if
-        nothing changed.
+        ``kept`` (N,) are the numbers of the matches on the page. ``step_chart`` is the chart of the yaw as of a step
+        about yaws, whose curve then takes the place of the run's. ``hidden`` leaves out the results, among them that
+        curve of the run. Sends nothing if nothing changed.
         """
         with self._lock:
             wanted = self._wanted
@@ -319,6 +319,10 @@ class YawView:
         shown_key = hypothesis if any(hypothesis == key for *_, key in story.hypotheses) else ""
         drawn = (trace, shown_key, selected, wanted, hidden, step_chart)
         if self._drawn is not None and self._drawn[1:] == drawn[1:] and self._drawn[0] is trace:
+            return
+        if hidden and step_chart is None:
+            update_widget(self._html, content=status_html(WITHHELD))
+            self._drawn = drawn
             return
         arcs = NO_ARCS if hidden else arcs_of_step(self._arcs_of(trace, selected), trace, step_key)
         if step_chart is not None:
@@ -374,10 +378,8 @@ class YawView:
 
 
 def untold(story: YawStory) -> YawStory:
-    """The story without its results: poses, their support, and the estimate."""
-    curves = tuple(curve for curve in story.curves if curve.kind != "level")
-    top = max([1.0, *(float(curve.y.max(initial=0.0)) for curve in curves)])
-    return replace(story, curves=curves, hypotheses=(), top=top, estimate_deg=None, peak_deg=None, note="")
+    """The story of a step that tells no result, without what the run found: poses, their support, and the estimate."""
+    return replace(story, hypotheses=(), estimate_deg=None, peak_deg=None, note="")
 
 
 def _window_of(argument: str) -> Window | None:

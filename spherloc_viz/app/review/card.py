@@ -70,7 +70,7 @@ def untold_html(opened: Opened, run: Run, bar: str) -> str:
     """The card of a run whose answers are hidden."""
     row = opened.recorded.row
     back = "" if run.request == opened.request else _way("run-return:", "back to the recorded run")
-    return _card([bar, _title(words.untold_title_of(row), row), back])
+    return _card([bar, _title(words.untold_title_of(row), row, told=False), back])
 
 
 def _card(parts: Sequence[str]) -> str:
@@ -78,10 +78,11 @@ def _card(parts: Sequence[str]) -> str:
     return f'<div class="review-card" style="{GROUND}">{content}</div>'
 
 
-def _title(title: str, row: RunRow) -> str:
+def _title(title: str, row: RunRow, told: bool = True) -> str:
+    """A heading; unless answers are ``told``, without the name of the file, which has the problem's."""
     return (
         f'<div style="font-weight:600;padding-top:.3em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis" '
-        f'title="{escape(row.file)}">{escape(title)}'
+        f'title="{escape(row.file) if told else ""}">{escape(title)}'
         f'<span style="font-weight:400;{DIM}"> · {escape(row.estimator)} #{row.seed}</span></div>'
     )
 

@@ -42,8 +42,8 @@ JUDGED = ("doubtful",)
 SUSPECT = "Runs whose diagnosis names a cause, by the truth where that is known; such a run may have been localized"
 """What the filter of ``JUDGED`` finds, said under a resting pointer."""
 FILTERS = (*EXACT, "judged", "outliers", "when")
-UNTOLD, UNTOLD_SORTS = ("estimator", "scene", "source", "when"), ("created", "name")
-"""Filters and orders that give no outcome away."""
+UNTOLD, UNTOLD_SORTS = ("estimator", "source", "when"), ("created",)
+"""Filters and orders that give no answer away."""
 UNFOLDED = (*EXACT[2:], "outliers", "when", "sort")
 """What is chosen in a row that is unfolded."""
 

@@ -226,7 +226,7 @@ class Reviewer:
     def _read(self, file: str) -> Opened:
         """Read a recording and open its scene."""
         row = self._has.library.row(file)
-        self._has.say(f"Opening {row.file} …")
+        self._has.say("Opening the recording …")
         run, path = self._has.library.read(file)
         got = reopen(run, path, self._has.roots)
         story = "" if run.origin is None else run.origin.story

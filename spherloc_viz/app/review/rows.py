@@ -47,7 +47,7 @@ def rows_html(
 
 
 def row_html(row: RunRow, marked: bool, opened: bool, now: datetime, hidden: bool = False) -> str:
-    """One run; ``hidden`` tells only what it is of."""
+    """One run; ``hidden`` tells only how it was made."""
     file = escape(row.file)
     ground = f"background:{OPENED};box-shadow:inset 2px 0 0 {style.css(style.ESTIMATE)}" if opened else ""
     look = "background:rgba(20,24,32,.55);color:#fff;border-radius:3px;padding:0 .2em;font-size:12px;line-height:1.25"
@@ -64,7 +64,7 @@ def row_html(row: RunRow, marked: bool, opened: bool, now: datetime, hidden: boo
     )
     hint, picture = _hint(row), row.thumbnail
     if hidden:
-        link, hint, picture = "", escape(row.file), b""
+        link, hint, picture = "", "Open this run", b""
     playing = row.source == "page" and not row.labels and not hidden
     keep = f'<div style="align-self:flex-end;padding-bottom:.2em">{keep_html(row.file)}</div>' if playing else ""
     about = f'<div style="flex:1;min-width:0">{_lines(row, now, hidden)}</div>'

@@ -8,6 +8,7 @@ from spherloc_viz.layers.frame import angle_text, length
 from spherloc_viz.recording.run_row import RunRow
 
 UNKNOWN = "–"
+UNTOLD_TITLE = "A run"
 COLORS = {"success": style.INLIER, "failure": style.OUTLIER, "unknown": style.UNDECIDED}
 """Colours of outcomes."""
 
@@ -19,9 +20,8 @@ def title_of(row: RunRow) -> str:
 
 
 def untold_title_of(row: RunRow) -> str:
-    """What the run is called where no answers are told: a case's title is one."""
-    name = row.name or row.scene
-    return f"{name}, {row.query}" if row.query and row.query not in name else name
+    """What the run is called where no answers are told: a case's title is one, and the name of a problem may be."""
+    return row.query or UNTOLD_TITLE
 
 
 def percent(share: float | None) -> str:
