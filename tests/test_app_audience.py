@@ -80,13 +80,15 @@ def test_an_audience_follows_the_presenter_each_with_a_state_of_its_own(house: H
     other_page, other = seat(house)
     for page in (early, other):
         until(lambda page=page: drawn(page) is presenter._run is not None)
-        until(lambda page=page: page._display.panels._diagnosis.content == presenter._display.panels._diagnosis.content)
-        assert "The presenter shows tiny" in page._status._line.content
+        until(lambda page=page: "The presenter shows tiny" in page._status._line.content)
+        until(lambda page=page: len(page._display.panels.steps._choice.options) > 1)
     opening, presented = title(early), title(presenter)
     for ending in ("Refinement", "Outcome"):
         steps = other._display.panels.steps
         other_page.set(steps._choice, next(name for name in steps._choice.options if name.endswith(ending)))
         until(lambda ending=ending: title(other) == ending)
+    told = presenter._display.panels._diagnosis  # at the last step
+    until(lambda: "Diagnosing" not in told.content and other._display.panels._diagnosis.content == told.content != "")
     assert (title(presenter), title(early)) == (presented, opening) and opening != "Outcome"
     other._touches.deliver(Touch("select", "3", 0, 0, 0, 0, False))
     until(lambda: "Match 3" in other._display.card._html.content)

@@ -25,7 +25,7 @@ from spherloc_viz.app.controls.estimator_controls import EstimatorControls, Opti
 from spherloc_viz.app.controls.steps_panel import find_step
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.painter import light_bytes, surface_bytes
-from spherloc_viz.app.text import diagnosis_html, status_html, step_html, table_html
+from spherloc_viz.app.text import diagnosis_html, key_step_html, status_html, step_html, table_html
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.app.workers import LatestWorker
 from spherloc_viz.layers import paint, steps
@@ -68,8 +68,9 @@ def test_every_text_is_escaped() -> None:
         step_html(Step("key", EVIL, EVIL, EVIL, EVIL)),
         table_html(Table("any", ("", ""), ((EVIL, EVIL), ("number", 3.0)))),
         table_html(Table("any", (EVIL, "", ""), ((EVIL, EVIL, EVIL),))),
-        diagnosis_html(Diagnosis(Cause.AMBIGUOUS, True, EVIL, (EVIL,), EVIL, False), whole=True),
-        diagnosis_html(Diagnosis(Cause.OK, False, EVIL, (), "", True), whole=True),
+        diagnosis_html(Diagnosis(Cause.AMBIGUOUS, True, EVIL, (EVIL,), EVIL, False)),
+        diagnosis_html(Diagnosis(Cause.OK, False, EVIL, (), "", True)),
+        key_step_html((StepHeading("a", EVIL), StepHeading("b", EVIL), StepHeading("outcome", EVIL)), 1, 0, True),
         status_html(EVIL, wrong=True),
     ]
     for html in pieces:
@@ -137,15 +138,22 @@ def test_the_given_scene_comes_first_and_once(tmp_path: Path) -> None:
 
 def test_a_diagnosis_tells_cause_evidence_and_advice_and_is_quiet_about_good_runs() -> None:
     wrong = Diagnosis(Cause.GRAVITY_OFF, True, "The summary.", ("One.", "Two."), "The advice.", False)
-    html = diagnosis_html(wrong, whole=True)
+    html = diagnosis_html(wrong)
     for part in ("Gravity prior off", "The summary.", "<li", "One.", "Two.", "The advice.", "without the truth"):
         assert part in html
-    short = diagnosis_html(wrong, whole=False)
-    assert "Gravity prior off" in short and "The summary." in short and "<li" not in short and "advice" not in short
-    named = diagnosis_html(replace(wrong, advice="Raise bound_px."), whole=True)
+    named = diagnosis_html(replace(wrong, advice="Raise bound_px."))
     assert "Raise Bound (px)." in named, "the page names an option as its settings do"
-    quiet = diagnosis_html(replace(wrong, cause=Cause.OK, doubtful=False, evidence=()), whole=True)
+    quiet = diagnosis_html(replace(wrong, cause=Cause.OK, doubtful=False, evidence=()))
     assert "The summary." in quiet and "advice" not in quiet and style.css(style.OUTLIER) not in quiet
+
+
+def test_steps_before_the_outcome_say_where_a_run_goes_wrong_and_not_why() -> None:
+    timeline = tuple(StepHeading(key, f"Title of {key}") for key in ("problem", "yaw-clique", "clique", "outcome"))
+    before, here, after = (key_step_html(timeline, 1, index, True) for index in (0, 1, 2))
+    assert before == after and "goes wrong at step 2" in before and 'data-touch="step:yaw-clique"' in before
+    assert "Title of yaw-clique" in before and "Here the run goes wrong" in here and 'data-touch="step:outcome"' in here
+    doubtful = key_step_html(timeline, 3, 1, False)
+    assert "is doubtful" in doubtful and 'data-touch="step:outcome"' in doubtful and "step 4" not in doubtful
 
 
 def test_wide_tables_have_headings_and_narrow_ones_none() -> None:

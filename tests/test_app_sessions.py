@@ -308,9 +308,11 @@ def test_diagnosis_comes_after_the_picture_and_only_for_the_newest_run(
         "the page goes on meanwhile"
     )
     gate.set()
-    until(lambda: "Two poses." in session._display.panels._diagnosis.content)
+    until(lambda: 'data-touch="step:' in session._display.panels._diagnosis.content)
+    assert "Two poses." not in session._display.panels._diagnosis.content, "a step before the last tells no cause"
     assert len(seen) == 2 and seen[1] is session._run.trace, "of fifteen runs meanwhile only the newest was diagnosed"
     page.set(session._display.panels.steps._buttons, "Next")
+    until(lambda: "Two poses." in session._display.panels._diagnosis.content)
     until(lambda: "cameras/alternative" in session._display.canvas._painter._drawn)
     page.set(session._display.panels.steps._buttons, "Previous")
     until(lambda: not session._display.canvas._painter._drawn["cameras/alternative"][0].visible)

@@ -11,6 +11,7 @@ import viser
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.synthetic import TrueCamera
 from spherloc.diagnosis import Diagnosis
+from spherloc.metrics import evaluate
 from spherloc.outcome import Judgement, known_judgement
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
@@ -20,10 +21,11 @@ from spherloc_viz.app.left_panels import LeftPanels
 from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.stage.canvas import Canvas, text_scale
-from spherloc_viz.app.text import diagnosis_html, hidden_html, status_html, summary_of
+from spherloc_viz.app.text import diagnosis_html, hidden_html, key_step_html, status_html, summary_of
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import changes_of, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
+from spherloc_viz.layers.key_step import key_step
 from spherloc_viz.layers.outcome import early_table
 from spherloc_viz.layers.point_cloud import cloud_items
 from spherloc_viz.layers.primitives import Label, Picture, SceneItem, Table
@@ -188,8 +190,7 @@ class RunDisplay:
             offered = hidden_html(withheld, not presenter) if withheld else ""
             cause = str(diagnosis.cause) if last and diagnosis is not None and diagnosis.doubtful else ""
             self.panels.draw(run, plain, pause is not None, outcome, selected, not told, offered, cause)
-            waiting = "" if hidden else status_html("Diagnosing …")
-            self.panels.diagnose(waiting if diagnosis is None else diagnosis_html(diagnosis, whole=last))
+            self.panels.diagnose("" if hidden else _diagnosed_html(trace, diagnosis, index))
             self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, not told)
         self._client.flush()
         return self.canvas.check() if pause is None else pause
@@ -247,3 +248,17 @@ class RunDisplay:
         if theme != self._theme:
             self._theme = theme
             set_theme(self._client.gui, theme)
+
+
+def _diagnosed_html(trace: Trace, diagnosis: Diagnosis | None, index: int) -> str:
+    """What the step at ``index`` says of a run's diagnosis, which is None until there is one: the last step says it,
+    those before it where to look, since nothing that the cause speaks of has been shown there."""
+    timeline = steps(trace)
+    if index == len(timeline) - 1:
+        return status_html("Diagnosing …") if diagnosis is None else diagnosis_html(diagnosis)
+    if diagnosis is None or not diagnosis.doubtful:
+        return ""
+    # Of a run that succeeded, the key step is where its consensus was found.
+    success = evaluate(trace).success
+    key = len(timeline) - 1 if success else key_step(trace, diagnosis)
+    return key_step_html(timeline, key, index, success is False)

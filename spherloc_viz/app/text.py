@@ -1,7 +1,7 @@
 """Text and tables as HTML. viser puts HTML into the page as it is, so every string is escaped here."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from html import escape
 
 import numpy as np
@@ -14,7 +14,7 @@ from spherloc_viz import style
 from spherloc_viz.layers.comparison import duration_text
 from spherloc_viz.layers.frame import angle_text, length
 from spherloc_viz.layers.outcome import UNKNOWABLE, verdict
-from spherloc_viz.layers.primitives import Step, Table
+from spherloc_viz.layers.primitives import Step, StepHeading, Table
 
 DIM = "opacity:.65"
 OPTIONS = {"bound_px": "Bound (px)", "noise_px": "Noise of an inlier (px)", "gravity_sd_deg": "Gravity sd (deg)"}
@@ -69,25 +69,37 @@ def table_html(table: Table) -> str:
     return box(f'<table style="border-collapse:collapse;width:100%"><tr>{head}</tr>{rows}</table>')
 
 
-def diagnosis_html(diagnosis: Diagnosis, whole: bool) -> str:
-    """Cause and summary and, if ``whole``, evidence and advice; of a run that looks right, the summary alone."""
+def diagnosis_html(diagnosis: Diagnosis) -> str:
+    """Cause, summary, evidence and advice; of a run that looks right, the summary alone."""
     if not diagnosis.doubtful:
         return box(f'<div style="{DIM}">{escape(diagnosis.summary)}</div>', "font-size:12px")
     color = style.css_text(style.OUTLIER)
+    evidence = "".join(f'<li style="padding-bottom:.2em">{escape(line)}</li>' for line in diagnosis.evidence)
+    known = "Judged with the truth." if diagnosis.used_truth else "Judged without the truth."
     parts = [
-        f"<div{' class=diagnosis-words' if whole else ''}>"
-        f'<div style="font-weight:600;color:{color}">{escape(diagnosis.cause.capitalize())}</div>'
-        f"<div>{escape(diagnosis.summary)}</div></div>",
+        f'<div class="diagnosis-words"><div style="font-weight:600;color:{color}">'
+        f"{escape(diagnosis.cause.capitalize())}</div><div>{escape(diagnosis.summary)}</div></div>",
+        f'<ul style="margin:.4em 0;padding-left:1.2em;font-size:12px">{evidence}</ul>' if evidence else "",
+        f"<div>{escape(_by_label(diagnosis.advice))}</div>",
+        f'<div style="font-size:12px;padding-top:.35em;{DIM}">{known}</div>',
     ]
-    if whole:
-        evidence = "".join(f'<li style="padding-bottom:.2em">{escape(line)}</li>' for line in diagnosis.evidence)
-        known = "Judged with the truth." if diagnosis.used_truth else "Judged without the truth."
-        parts += [
-            f'<ul style="margin:.4em 0;padding-left:1.2em;font-size:12px">{evidence}</ul>' if evidence else "",
-            f"<div>{escape(_by_label(diagnosis.advice))}</div>",
-            f'<div style="font-size:12px;padding-top:.35em;{DIM}">{known}</div>',
-        ]
     return box("".join(parts))
+
+
+def key_step_html(steps: Sequence[StepHeading], key: int, here: int, failed: bool) -> str:
+    """At a step before the last: a link to the step at which a run ``failed`` or became doubtful or, at that step, to
+    the last one, which says why. ``key`` and ``here`` are indices in ``steps``."""
+    last, goes = len(steps) - 1, "goes wrong" if failed else "becomes doubtful"
+    if key == last:
+        return _pointer(f"Why the run {'failed' if failed else 'is doubtful'}, ", steps[last], "the outcome says")
+    if here == key:
+        return _pointer(f"Here the run {goes}. ", steps[last], "The outcome says why")
+    return _pointer(f"The run {goes} at step {key + 1}: ", steps[key], steps[key].title)
+
+
+def _pointer(words: str, step: StepHeading, name: str) -> str:
+    go = f'<span class="term" role="button" tabindex="0" data-touch="step:{escape(step.key)}">{escape(name)}</span>'
+    return box(f'<span style="{DIM}">{escape(words)}</span>{go}.', "font-size:12px")
 
 
 def _by_label(advice: str) -> str:
