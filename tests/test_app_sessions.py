@@ -21,7 +21,7 @@ from spherloc.geometry import align_to_down, camera_centre
 from spherloc.trace import Trace
 from spherloc_viz.app import compilation
 from spherloc_viz.app import session as session_module
-from spherloc_viz.app.catalog import Catalog
+from spherloc_viz.app.catalog import Catalog, Run
 from spherloc_viz.app.compilation import Compilation
 from spherloc_viz.app.server import Sessions
 from spherloc_viz.app.services import Services
@@ -587,6 +587,25 @@ def test_answers_are_hidden_until_they_are_asked_for(house: House) -> None:
     until(lambda: "answers=hidden" in session._addresses[0].content)
     page.set(display._hide, False)
     until(lambda: "Success" in told() and "answers=hidden" not in session._addresses[0].content)
+
+
+def test_a_link_hides_the_answers_before_its_run_is_seen(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, session = house.visit()
+    draw, arrive, seen = session._display.draw, session._arrive, []
+
+    def note(run: Run, *given: Any) -> float | None:
+        seen.append((run.request.scene.seed, session._controls.display.answers))
+        return draw(run, *given)
+
+    def arrive_late(*given: Any) -> None:
+        until(lambda: any(seed == 9 for seed, _ in seen))
+        arrive(*given)
+
+    monkeypatch.setattr(session._display, "draw", note)
+    monkeypatch.setattr(session, "_arrive", arrive_late)
+    session._touches.deliver(Touch("link", "v=1&scene=tiny&seed=9&answers=hidden", 0, 0, 0, 0, False))
+    until(lambda: session._arrived == 1)
+    assert {answers for seed, answers in seen if seed == 9} == {"hidden"}
 
 
 def test_a_slow_run_gives_way_and_can_be_cancelled(house: House) -> None:
