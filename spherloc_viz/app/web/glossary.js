@@ -38,14 +38,17 @@
       const again = event.target instanceof Element && event.target.closest(".introduce");
       if (again || (event.target === dialog && beside)) dialog.close();
     });
-    // Keys that mean something on the page mean nothing here.
-    dialog.addEventListener("keydown", (event) => event.stopPropagation());
     dialog.addEventListener("close", () => dialog.remove());
     document.body.append(dialog);
     dialog.showModal();
   }
 
   const term = (event) => (event.target instanceof Element ? event.target.closest("[data-define]") : null)?.dataset.define;
+
+  // Keys that mean something on the page mean nothing here. Goes before the scripts that listen for them.
+  addEventListener("keydown", (event) => {
+    if (document.querySelector("dialog.glossary[open]")) event.stopImmediatePropagation();
+  }, true);
 
   addEventListener("click", (event) => {
     const asked = term(event);

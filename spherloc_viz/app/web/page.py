@@ -18,8 +18,8 @@ STYLE = "touch.css"
 SCRIPTS = (
     "changes.js",
     "presses.js",
-    "touch.js",
     "glossary.js",
+    "touch.js",
     "introduction.js",
     "captions.js",
     "opening.js",

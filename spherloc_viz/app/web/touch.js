@@ -190,6 +190,7 @@
     const writing = event.target instanceof Element
       && event.target.closest("input:not([type=checkbox]):not([type=radio]),textarea,select,[contenteditable=true],[role=listbox]");
     if (event.key === "Escape" && !writing) {
+      if (seenElements("[role=dialog]").length > 0) return; // what lies over the page is what it closes
       const corner = { left: 0, top: 0, width: 1, height: 1 };
       tell("deselect:", corner, { clientX: 0, clientY: 0 }, { x: 0, y: 0 });
       return;
