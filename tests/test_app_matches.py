@@ -144,9 +144,13 @@ def test_selected_rows_are_marked_and_brought_up(server: viser.ViserServer, page
     table.draw(trace, (55,), kept)
     mark = f"background:{style.css(style.SELECTED)}"
     assert 55 in numbers(table) and table._html.content.count(mark) == 1
+    assert table._html.content.count("data-reveal") == 1 and 'data-reveal="match-55"' in table._html.content
     page.press("match-page:0")
     table.draw(trace, (55,), kept)
     assert numbers(table)[0] == 0, "turning the page is not undone"
+    assert "data-reveal" not in table._html.content
+    table.draw(trace, (3, 8, 55), kept)
+    assert re.findall(r'data-reveal="([^"]*)"', table._html.content) == ["match-3"]
     table.draw(trace, (3, 55), kept)
     assert numbers(table)[0] == 0 and table._html.content.count(mark) == 1
 

@@ -117,8 +117,8 @@ class MatchTablePanel:
     def draw(self, trace: Trace, selected: tuple[int, ...], kept: NDArray, hidden: bool = False) -> None:
         """Show the matches of a run. ``selected`` are indices in the problem, ``kept`` (N,) the original numbers.
 
-        If a match was just selected elsewhere, the table turns to its page. ``hidden`` shows no matches, since all
-        columns are answers.
+        If a match was just selected elsewhere, the table turns to its page and is scrolled to its row. ``hidden`` shows
+        no matches, since all columns are answers.
         """
         if hidden:
             self._drawn = None
@@ -161,7 +161,8 @@ class MatchTablePanel:
 def table_html(rows: MatchColumns, listed: IntArray, look: TableLook, selected: frozenset[int], kept: NDArray) -> str:
     """The current page of the matches ``listed``, with the buttons above and below it."""
     shown = listed[look.page * PAGE : (look.page + 1) * PAGE]
-    body = "".join(_row(rows, int(k), int(k) in selected, int(kept[k])) for k in shown)
+    revealed = next((k for k in shown.tolist() if k in selected), -1)
+    body = "".join(_row(rows, k, k in selected, k == revealed, int(kept[k])) for k in shown.tolist())
     table = (
         '<table style="border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums;margin-top:.3em">'
         f"<tr>{_headings(rows, look)}</tr>{body}</table>"
@@ -194,16 +195,18 @@ def _headings(rows: MatchColumns, look: TableLook) -> str:
     return "".join(cells)
 
 
-def _row(rows: MatchColumns, k: int, chosen: bool, number: int) -> str:
+def _row(rows: MatchColumns, k: int, chosen: bool, revealed: bool, number: int) -> str:
     cell, right = '<td style="padding:.08em .3em">', '<td style="padding:.08em .3em;text-align:right">'
     mark = (
         f"background:{style.css(style.SELECTED)}1c;box-shadow:inset 3px 0 {style.css(style.SELECTED)}" if chosen else ""
     )
+    reveal = f' data-reveal="match-{number}"' if revealed else ""
     truth = "–" if rows.right is None else _word(bool(rows.right[k]))
     agree = "–" if rows.agree[k] < 0 else f"{rows.agree[k]}"
     return (
-        f'<tr tabindex="0" data-touch="select:{number}" style="{mark}">{cell}{number}</td>'
-        f"{cell}{_word(bool(rows.kept[k]))}</td>{cell}{truth}</td>{right}{_number(rows.px[k])}</td>{right}{_number(rows.deg[k])}</td>{right}{agree}</td></tr>"
+        f'<tr tabindex="0" data-touch="select:{number}" style="{mark}"{reveal}>{cell}{number}</td>'
+        f"{cell}{_word(bool(rows.kept[k]))}</td>{cell}{truth}</td>{right}{_number(rows.px[k])}</td>"
+        f"{right}{_number(rows.deg[k])}</td>{right}{agree}</td></tr>"
     )
 
 

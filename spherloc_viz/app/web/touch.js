@@ -8,7 +8,8 @@
 (() => {
   const TOUCHABLE = "[data-touch],[data-copy]", MIN_DRAG_PX = 6, LOOK_EVERY_MS = 150;
   const REVEAL_MS = 3000, COPIED_MS = 5000;
-  let press = null, shade = null, seen = null, revealed = null, revealUntil = 0, titled = null;
+  let press = null, shade = null, seen = null, titled = null;
+  let revealUntil = new Map();  // by the names of the elements that are to be revealed: until when they are scrolled to
   // The tabs of a step and of a link that were opened last, among the views and elsewhere, and the last report.
   let front = "", asked = "", elsewhere = "", told = "";
   const fetched = new Set();  // downloads that were begun
@@ -74,10 +75,11 @@
   }
 
   function reveal() {
-    const element = seenElements("[data-reveal]")[0], name = element?.dataset.reveal ?? null;
-    if (name !== revealed) revealUntil = Date.now() + REVEAL_MS;
-    revealed = name;
-    if (element && Date.now() < revealUntil) element.scrollIntoView({ block: "nearest" });
+    const elements = seenElements("[data-reveal]"), now = Date.now(), before = revealUntil;
+    revealUntil = new Map(elements.map(({ dataset: { reveal: name } }) => [name, before.get(name) ?? now + REVEAL_MS]));
+    for (const element of elements) {
+      if (now < revealUntil.get(element.dataset.reveal)) element.scrollIntoView({ block: "nearest" });
+    }
   }
 
   function valueOf(name) {
@@ -147,7 +149,7 @@
   }
 
   for (const kind of ["wheel", "touchmove", "pointerdown"])
-    addEventListener(kind, () => { revealUntil = 0; }, { capture: true, passive: true });
+    addEventListener(kind, () => { for (const name of revealUntil.keys()) revealUntil.set(name, 0); }, { capture: true, passive: true });
 
   addEventListener("pointerdown", (event) => {
     const element = event.button === 0 ? found(event) : null;
