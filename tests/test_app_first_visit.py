@@ -17,8 +17,11 @@ from spherloc_viz.app.glossary import linked
 from spherloc_viz.app.introduction import MOMENTS, introduction_html, opening_step
 from spherloc_viz.app.plots.residual_view import ResidualView
 from spherloc_viz.app.plots.yaw_view import YawView
+from spherloc_viz.app.review.filters import Counts, Look, filters_html
+from spherloc_viz.app.text import step_html, table_html
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
+from spherloc_viz.layers.outcome import outcome_table
 
 
 def test_terms_are_marked_where_they_first_stand() -> None:
@@ -77,3 +80,15 @@ def test_captions_define_the_great_words() -> None:
     marked = [set(re.findall(r"data-define=\"([^\"]+)", caption)) for caption in captions]
     for term in ("arc", "ball", "maximum clique", "edge", "inlier"):
         assert any(term in here for here in marked), term
+
+
+def test_words_of_notes_tables_and_filters_are_defined(server: viser.ViserServer) -> None:
+    """Those that a newcomer asked for."""
+    trace = estimate(scene_problem("mei_outliers_80"), "mc-exact")
+    last = paint(trace, len(steps(trace)) - 1)
+    words = step_html(last.step, linked) + table_html(outcome_table(trace), linked)
+    words += filters_html(Look(), Counts(2, (("failure", 1), ("success", 1)), (("ok", 1),), 1))
+    asked = {"NFA", "certificate", "estimator", "precision", "recall", "F1", "suspect"}
+    assert asked <= set(re.findall(r'data-define="([^"]+)"', words))
+    guessed = linked("The front end expects about 90 % to be wrong.")
+    assert 'data-define="front end"' in guessed

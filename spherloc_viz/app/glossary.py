@@ -28,21 +28,37 @@ TERMS: dict[str, str] = {
     "bound": "How far a match may be off, in pixels, to count as an inlier.",
     "inlier": "A match within the bound of the pose at hand.",
     "outlier": "A match beyond the bound of the pose at hand.",
+    "consensus": "All matches within the bound of a pose. Maximum consensus looks for the pose that has most.",
+    "precision": "Share of the inliers that are right.",
+    "recall": "Share of the right matches that are inliers.",
+    "F1": "One number for precision and recall, their harmonic mean: 100 % where both are.",
     "residual": "How far the map point is seen from the pixel of its match, with the pose at hand.",
     "refinement": "Gauss-Newton steps that move the pose until the residuals of its inliers are least.",
     "RANSAC": "Draws the smallest sample that fixes a pose, counts the matches that agree, and keeps the best.",
     "sample": "The matches that RANSAC draws to fix one pose.",
     "certificate": "A bound that no pose can beat; where the pose at hand reaches it, it is proven to be the best.",
+    "NFA": "Number of false alarms: how many sets of so many wrong matches are expected to agree with some pose by "
+    "chance. Far below 1, the matches do not agree by chance; near 1 or above, nobody can know the pose.",
     "covariance": "How sure the pose is by its inliers: drawn as an ellipsoid of three standard deviations.",
+    "alternative pose": "Another pose that is worth a look: one that explains about as many matches, or the right one "
+    "where the truth is known.",
     "estimator": "A method that computes the pose from all matches, most of them wrong. mc-exact can prove its answer, "
     "mc is the paper's, ransac-2p draws pairs; the others are baselines that draw larger samples.",
+    "diagnosis": "The cause that explains best why a run failed or cannot be trusted, with its evidence and advice.",
+    "doubtful": "What a run is judged without the truth that has a pose and a reason not to trust it.",
+    "suspect": "Of recorded runs: the diagnosis names a cause. Such a run may still have been localized.",
+    "front end": "What makes matches of images: it finds features, matches them with those of the references, and "
+    "looks up their map points.",
+    "query": "The image whose camera is to be localized.",
+    "reference": "An image of the map with a known pose; the query is matched with it.",
+    "seed": "The number from which all random draws follow: the same seed gives the same run again.",
     "step": "A moment of a run with a picture and words of its own. Previous, Next and the timeline walk through them.",
     "scene": "What there is to localize: a simulation, drawn or real images, or a file of matches.",
     "sweep": "Many runs while one property of the scene grows, to see from where on an estimator fails.",
     "recording": "A file of one run with all its numbers: it opens again here, in Rerun's viewer, and in Python.",
 }
 """By the word that stands on the page."""
-_PLURALS = {"match": "matches", "maximum clique": "maximum cliques"}
+_PLURALS = {"match": "matches", "query": "queries", "diagnosis": "diagnoses"}
 _FORMS = {form: term for term in TERMS for form in (term, _PLURALS.get(term, f"{term}s"))}
 _WORDS = re.compile(rf"\b({'|'.join(sorted(map(re.escape, _FORMS), key=len, reverse=True))})\b")
 

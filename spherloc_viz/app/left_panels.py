@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from spherloc.datasets.map_scene import MapScene
 from spherloc_viz.app.catalog import Run
 from spherloc_viz.app.controls.steps_panel import StepsPanel
-from spherloc_viz.app.glossary import glossary_html, heading_html
+from spherloc_viz.app.glossary import glossary_html, heading_html, linked
 from spherloc_viz.app.introduction import introduction_html
 from spherloc_viz.app.link import TABS
 from spherloc_viz.app.matches.image_panel import ImagePanel
@@ -115,7 +115,7 @@ class LeftPanels:
             self._lens.draw(run, hidden)
         if "Matches" in seen:
             self.matches.draw(run.trace, selected, kept, hidden)
-        summary, ending = ("", "") if hidden else (summary_html(run.trace, cause), table_html(outcome))
+        summary, ending = ("", "") if hidden else (summary_html(run.trace, cause), table_html(outcome, linked))
         summary = offered + summary
         if self._opening == run.request.scene.scene:
             self._opening = self._card.content = ""

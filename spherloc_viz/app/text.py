@@ -38,8 +38,8 @@ def box(content: str, css: str = "") -> str:
 
 
 def step_html(step: Step, caption_html: Callable[[str], str] = escape, end: str = "") -> str:
-    """Title, caption, equation and note of a step; ``caption_html`` makes HTML of the words of the caption. ``end``
-    says that it is the "first" or the "last" one, so that the page's script can disable a button."""
+    """Title, caption, equation and note of a step; ``caption_html`` makes HTML of the words of caption and note.
+    ``end`` says that it is the "first" or the "last" one, so that the page's script can disable a button."""
     parts = [
         '<div class="step-title" style="font-size:15px;font-weight:600;padding-bottom:.25em">'
         f"{escape(step.title)}</div>",
@@ -49,19 +49,21 @@ def step_html(step: Step, caption_html: Callable[[str], str] = escape, end: str 
         face = "font-family:Cambria,Georgia,serif;font-style:italic;font-size:14px"
         parts.append(f'<div class="step-equation" style="{face};padding-top:.4em;{DIM}">{escape(step.equation)}</div>')
     if step.note:
-        parts.append(f'<div class="step-note" style="font-size:12px;padding-top:.35em;{DIM}">{escape(step.note)}</div>')
+        parts.append(
+            f'<div class="step-note" style="font-size:12px;padding-top:.35em;{DIM}">{caption_html(step.note)}</div>'
+        )
     return box(f'<div class="step-words" data-end="{end}">{"".join(parts)}</div>')
 
 
-def table_html(table: Table) -> str:
-    """A table: of names and values without headings, a wider one with them."""
+def table_html(table: Table, name_html: Callable[[str], str] = escape) -> str:
+    """A table: of names and values without headings, a wider one with them; ``name_html`` makes HTML of a name."""
     cell = "padding:.09em .9em .09em 0;vertical-align:top"
     name_css, value_css = f"{cell};white-space:nowrap;{DIM}", f"{cell};"
     head = ""
     if len(table.columns) > 2:
         head = "".join(f'<td style="{name_css}">{escape(name)}</td>' for name in table.columns)
     rows = "".join(
-        f'<tr><td style="{name_css}">{escape(str(row[0]))}</td>'
+        f'<tr><td style="{name_css}">{name_html(str(row[0]))}</td>'
         + "".join(f'<td style="{value_css}{_value_css(value)}">{escape(str(value))}</td>' for value in row[1:])
         + "</tr>"
         for row in table.rows

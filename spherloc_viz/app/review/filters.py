@@ -6,6 +6,7 @@ from datetime import datetime
 from html import escape
 
 from spherloc_viz import style
+from spherloc_viz.app.glossary import help_html
 from spherloc_viz.app.review.words import COLORS
 from spherloc_viz.app.text import DIM, box, dot_html
 from spherloc_viz.recording.index.query import MAX_TEXT, OUTCOMES, PAGE_KEPT, Range, RunQuery, parse_range, parse_when
@@ -175,7 +176,9 @@ def filters_html(look: Look, counts: Counts, hidden: bool = False) -> str:
     ]
     if counts.doubtful or look.judged:
         words = f'suspect <span style="{DIM}">{counts.doubtful:,}</span>'
-        chips.append(pill(words, f"runs-filter:judged:{JUDGED[0]}", look.judged == JUDGED[0], SUSPECT))
+        chips.append(
+            pill(words, f"runs-filter:judged:{JUDGED[0]}", look.judged == JUDGED[0], SUSPECT) + help_html("suspect")
+        )
     if counts.pages:
         hint = f"Runs that pages made by themselves; the newest {PAGE_KEPT} are stored, and those that you keep"
         number = f'<span style="{DIM}">{counts.pages:,}</span>'
