@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from spherloc.estimators import options_type
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.controls.estimator_controls import EstimatorControls
 from spherloc_viz.app.controls.presets import presets
-from spherloc_viz.app.controls.scene_controls import LISTED_QUERIES, SceneControls
+from spherloc_viz.app.controls.scene_controls import CHANGED, LISTED_QUERIES, SceneControls
 from spherloc_viz.app.controls.simulation_controls import KINDS, SIMULATED
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from tests.datasets.test_rendered import SMALL
@@ -291,3 +292,25 @@ def test_a_typed_number_that_no_solver_can_reckon_with_is_refused(server: viser.
             controls.read()
     box.value = 0.5
     assert controls.read()[1].noise_px == 0.5
+
+
+def test_a_changed_simulation_does_not_go_by_the_name_of_its_scene(controls: SceneControls) -> None:
+    """That name tells a rate of outliers, which the run may no longer have."""
+    scene = CATALOG.synthetic(FIRST)
+    assert scene is not None
+    changed, name = SceneRequest(FIRST, scene.seed, None, Variation(outlier_rate=0.3)), CHANGED.format(FIRST)
+    controls.write(changed)
+    assert controls._scene.value == name == controls._scene.options[0] and controls.read() == changed
+    assert not controls.follow_scene()
+    # Whoever chooses the scene again gets it as it is.
+    controls._scene.value = FIRST
+    controls._choose(viser.GuiEvent(None, None, controls._scene))
+    assert not controls.follow_scene(), "the server's own setting is no choice"
+    controls.write(changed)
+    controls._scene.value = FIRST
+    controls._choose(SimpleNamespace(client="somebody", target=controls._scene))
+    assert controls.follow_scene() and controls.read() == SceneRequest(FIRST, scene.seed)
+    assert controls._scene.value == FIRST and controls._scene.options == tuple(CATALOG.scenes)
+    # A value that the scene has is no change.
+    controls.write(SceneRequest(FIRST, 3, None, Variation(outlier_rate=scene.outlier_rate, spoiled=(1,))))
+    assert controls._scene.value == FIRST

@@ -130,6 +130,16 @@ class Variation:
         changed = replace(scene, **changes)
         return replace(changed, name=_changed_name(scene, changed, changes.keys()))
 
+    def words(self, scene: SyntheticScene) -> tuple[str, ...]:
+        """What is changed about a synthetic scene, a few words for each value, such as "30 % outliers".
+
+        Raises ``InputError`` for a value that it cannot have.
+        """
+        changed = self.scene(scene)
+        assert isinstance(changed, SyntheticScene)
+        words = _words(changed)
+        return tuple(words[name] for name in words if name in self.simulation)
+
     def edit(self, problem: Problem, seed: int) -> Problem:
         """An unedited problem with these matches spoiled, mended and hidden."""
         if not self.edited:
@@ -175,20 +185,24 @@ class Variation:
 def _changed_name(scene: SyntheticScene, changed: SyntheticScene, fields_changed: Iterable[str]) -> str:
     """The scene's name with its outlier rate brought up to date, followed by the other changes."""
     before, now = (f"{100 * rate:.3g} % outliers" for rate in (scene.outlier_rate, changed.outlier_rate))
-    name = scene.name.replace(before, now)
-    words = {
+    name, words = scene.name.replace(before, now), _words(changed)
+    told = [words[field] for field in words if field in fields_changed and words[field] not in name]
+    return ", ".join([name, *told])
+
+
+def _words(changed: SyntheticScene) -> dict[str, str]:
+    """Every value of a scene that a variation can change, in a few words."""
+    return {
         "camera": f"through {model_name(changed.camera)}",
         "correspondences": f"{changed.correspondences} matches",
         "noise_px": f"{changed.noise_px:g} px noise",
-        "outlier_rate": now,
+        "outlier_rate": f"{100 * changed.outlier_rate:.3g} % outliers",
         "outlier_kind": f"{changed.outlier_kind} outliers",
         "field_of_view_deg": f"{changed.field_of_view_deg:g}° wide",
         "cloud_height_m": f"{changed.cloud_height_m:g} m high",
         "gravity_error_deg": f"gravity error {changed.gravity_error_deg:g}° (1 sd)",
         "true_camera": "camera moved",
     }
-    told = [words[field] for field in words if field in fields_changed and words[field] not in name]
-    return ", ".join([name, *told])
 
 
 def used_seed(scene: Scene, seed: int | None) -> int:

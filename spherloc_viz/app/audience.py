@@ -108,10 +108,10 @@ class Audience:
             if shown is None:
                 self._status.say(WAITING)
                 return None
-            request, withheld = shown.run.request, shown.withheld
+            request, name, withheld = shown.run.request, shown.run.trace.problem.name, shown.withheld
             how = f"{request.estimator}, seed {request.scene.seed}."
             self._status.hide_answers(bool(withheld | self._display.withheld(shown.run)))
-            self._status.say(f"The presenter shows {request.scene.scene}, {how}", untold=f"The presenter shows {how}")
+            self._status.say(f"The presenter shows {name}, {how}", untold=f"The presenter shows {how}")
             selected = self._edits.places(shown.run.kept)
             return self._display.draw(shown.run, shown.mesh, shown.diagnosis, selected, asked, now, withheld)
         except Exception as error:

@@ -10,6 +10,7 @@ from typing import Any, Literal, Protocol
 import viser
 
 from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.diagnosis import Diagnosis
 from spherloc.errors import InputError
 from spherloc.trace import Trace
@@ -275,7 +276,8 @@ class Controls:
     def draw(self, run: Run, diagnosis: Diagnosis | None, hidden: bool) -> None:
         """Show what belongs to the newest run; ``diagnosis`` is None until it is ready; ``hidden`` hides answers."""
         self._follow_preset(run.request, hidden)
-        html = _changes_html(run, hidden)
+        self.scene.name_scene(run.request.scene)
+        html = _changes_html(run, self._catalog.synthetic(run.request.scene.scene), hidden)
         if self._edits.content != html:
             self._edits.content, self._edits.visible = html, bool(html)
         self.compare.draw(run.trace, hidden)
@@ -388,13 +390,13 @@ DONE = {"spoiled": "made wrong", "mended": "made right", "hidden": "hidden"}
 """What was done to single matches, by the field of a variation, in words."""
 
 
-def _changes_html(run: Run, hidden: bool) -> str:
-    """What is not as the scene's name says, and what was done to single matches; empty if nothing was. ``hidden`` says
-    only that something was done."""
+def _changes_html(run: Run, scene: SyntheticScene | None, hidden: bool) -> str:
+    """What is not as the file of the scene has it, and what was done to single matches; empty if nothing was.
+    ``hidden`` says only that something was done."""
     variation, parts = run.request.scene.variation, []
-    label, name = run.request.scene.scene, run.trace.problem.name.removesuffix(", edited")
-    if not hidden and not name.startswith(label) and not label.startswith(name):
-        parts.append(f"Changed: {escape(name)}")
+    told = () if scene is None or hidden else variation.words(scene)
+    if told:
+        parts.append(f"Changed from the scene: {escape(', '.join(told))}")
     done = [f"{len(getattr(variation, name))} {words}" for name, words in DONE.items() if getattr(variation, name)]
     if done:
         links = [("unedit:", "take back")] + [("unhide:", "show hidden")] * bool(variation.hidden)

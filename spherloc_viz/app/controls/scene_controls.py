@@ -1,5 +1,6 @@
 """The widgets that choose a scene and change it."""
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -12,8 +13,10 @@ from spherloc.errors import InputError
 from spherloc_viz.app.catalog import Catalog, SceneRequest
 from spherloc_viz.app.controls.simulation_controls import SimulationControls
 from spherloc_viz.app.text import box
-from spherloc_viz.app.web.viser_internals import number_of, put
+from spherloc_viz.app.web.viser_internals import at_once, number_of, put
 
+CHANGED = "Changed from {}"
+"""What the list of scenes calls the scene at hand while its simulation is not as its file has it."""
 LISTED_QUERIES = 50
 """A page with thousands of entries in a dropdown is slow; of more, those that fit a filter are listed."""
 
@@ -29,6 +32,9 @@ class SceneControls:
     def __init__(self, gui: viser.GuiApi, catalog: Catalog, changed: Changed) -> None:
         self._catalog = catalog
         self._followed = ""
+        self._naming = threading.Lock()
+        self._chosen = False
+        """Whether a scene was chosen by hand since the last one was followed, be it the same again."""
         self._scene = gui.add_dropdown("Scene", tuple(catalog.scenes))
         self._find = gui.add_text("Find query", "", visible=False, hint="Part of the name of a query image.")
         self._found = gui.add_html("", visible=False)
@@ -37,6 +43,7 @@ class SceneControls:
         self._simulation = SimulationControls(gui, catalog.cameras, changed)
         self._seed = gui.add_text("Seed", "0", hint="Of the simulation and of the estimator's random draws.")
         self._find.on_update(self._filter)
+        self._scene.on_update(self._choose)
         for widget in (self._scene, self._query, self._seed):
             widget.on_update(changed)
 
@@ -46,10 +53,11 @@ class SceneControls:
         return self._simulation.reset
 
     def follow_scene(self) -> bool:
-        """If another scene was chosen, set the other widgets to its values; returns whether that was so."""
-        label = self._scene.value
-        if label == self._followed:
+        """If a scene was chosen, set the other widgets to its values; returns whether that was so."""
+        label, chosen = self._label(), self._chosen
+        if label == self._followed and not chosen:
             return False
+        self._chosen = False
         self.write(SceneRequest(label, getattr(self._catalog.scenes[label], "seed", self._read_seed(0))))
         return True
 
@@ -63,14 +71,14 @@ class SceneControls:
 
         Raises ``InputError`` if the seed is not a valid number.
         """
-        label, seed = self._scene.value, self._read_seed()
+        label, seed = self._label(), self._read_seed()
         if self._catalog.map_scene(label) is not None:
             return SceneRequest(label, seed, self._query.value)
         return SceneRequest(label, seed, None, self._variation(label))
 
     def read_unchanged(self) -> SceneRequest:
         """The scene and the query that the widgets say, with everything else as the scene has it."""
-        label = self._scene.value
+        label = self._label()
         query = None if self._catalog.map_scene(label) is None else self._query.value
         return SceneRequest(label, getattr(self._catalog.scenes[label], "seed", 0), query)
 
@@ -82,9 +90,9 @@ class SceneControls:
         if request.scene not in self._catalog.scenes:
             raise InputError(f"the scene '{request.scene}' is not open on this page; open it first.")
         another = request.scene != self._followed
-        self._followed = request.scene
-        self.list_scenes()
-        put(self._scene, request.scene)
+        with self._naming:
+            self._followed = request.scene
+            self._name_scene(request)
         images = self._catalog.map_scene(request.scene)
         if images is not None:
             self._write_query(images, request.query)
@@ -95,11 +103,27 @@ class SceneControls:
         put(self._seed, str(request.seed))
         return another
 
-    def list_scenes(self) -> None:
-        """Offer what the catalog has now."""
-        labels = tuple(self._catalog.scenes)
-        if labels != tuple(self._scene.options):
-            self._scene.options = labels
+    def name_scene(self, request: SceneRequest) -> None:
+        """Show whether the scene at hand is as its name says, by the request of a run of it; nothing for a run of
+        another scene."""
+        with self._naming:
+            if request.scene == self._followed:
+                self._name_scene(request)
+
+    def _name_scene(self, request: SceneRequest) -> None:
+        """Offer the scenes that the catalog has now, and show which one a request is of. Its name tells, for example,
+        a rate of outliers, so that a changed simulation has another name."""
+        labels, shown = tuple(self._catalog.scenes), request.scene
+        scene = self._catalog.synthetic(request.scene)
+        if any(value != getattr(scene, name) for name, value in request.variation.simulation.items()):
+            shown = CHANGED.format(request.scene)
+            labels = (shown, *labels)
+        # What is shown is on offer at any time.
+        for offered in (tuple(dict.fromkeys((*labels, self._scene.value))), labels):
+            if offered != tuple(self._scene.options) and self._scene.value in offered:
+                self._scene.options = offered
+            if self._scene.value != shown:
+                put(self._scene, shown)
 
     @property
     def true_camera(self) -> TrueCamera | None:
@@ -141,9 +165,18 @@ class SceneControls:
         )
 
     def _filter(self, event: Any) -> None:
-        images = self._catalog.map_scene(self._scene.value)
+        images = self._catalog.map_scene(self._label())
         if images is not None and event.client is not None:
             self._list_queries(images, self._query.value)
+
+    def _label(self) -> str:
+        """The label of the scene that the list shows."""
+        shown = self._scene.value
+        return shown if shown in self._catalog.scenes else self._followed
+
+    @at_once
+    def _choose(self, event: Any) -> None:
+        self._chosen |= event.client is not None and event.target.value in self._catalog.scenes
 
     def _read_seed(self, otherwise: int | None = None) -> int:
         text = self._seed.value.strip()
