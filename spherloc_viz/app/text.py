@@ -138,12 +138,16 @@ def opening_card_html(label: str, words: str, share: float | None) -> str:
     return f'<div hidden data-opening="{escape(json.dumps(told))}"></div>'
 
 
+SOLVED = "solved in "
+AGAIN = "this time; the same run made again takes a little more or less"
+
+
 def summary_of(trace: Trace) -> tuple[str, list[str]]:
     """A run's verdict, and its errors, inliers and time. Without the truth the verdict is what the run is judged as,
     once that is known."""
     metrics = evaluate(trace)
     inliers = int(np.count_nonzero(trace.inlier_mask))
-    facts = [f"{inliers} of {len(trace.problem)} inliers", duration_text(trace.timings_ms["total"])]
+    facts = [f"{inliers} of {len(trace.problem)} inliers", f"{SOLVED}{duration_text(trace.timings_ms['total'])}"]
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         facts = [
             angle_text(metrics.rotation_error_deg),
@@ -160,7 +164,14 @@ def summary_html(trace: Trace, cause: str = "") -> str:
     """A run in one line; ``cause`` is what is wrong with it, if that is to be told."""
     words, facts = summary_of(trace)
     told = f"{words.capitalize()}: {cause}" if cause else words.capitalize()
-    line = f'<b style="{_value_css(words)}">{escape(told)}</b> · ' + " · ".join(map(escape, facts))
+    # In a narrow line the time stands alone; under a resting pointer it says what it is the time of.
+    shown = (
+        f'<span title="{SOLVED.capitalize()}{AGAIN}">{escape(fact.removeprefix(SOLVED))}</span>'
+        if fact.startswith(SOLVED)
+        else escape(fact)
+        for fact in facts
+    )
+    line = f'<b style="{_value_css(words)}">{escape(told)}</b> · ' + " · ".join(shown)
     return box(line, "font-size:12.5px;padding-top:.2em")
 
 

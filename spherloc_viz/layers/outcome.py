@@ -101,7 +101,7 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
         bound = f"{view.bounds.noise_px:.3g} px"
         caption += f" within {bound} and what the error of gravity may add, {explained} of them within {bound}"
     if metrics.rotation_error_deg is None or metrics.translation_error_m is None:
-        caption += f", found in {total:.1f} ms{proven}. "
+        caption += f", solved in {total:.1f} ms{proven}. "
         caption += "The truth is unknown: only the matches speak for it or against it."
         limits = ""
     else:
@@ -110,7 +110,7 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
         angle, length = angle_text(metrics.rotation_error_deg), view.length(metrics.translation_error_m)
         limit = view.length(SUCCESS_M)
         caption += (
-            f"{proven}. The pose, found in {total:.1f} ms, is {angle} and {length} off the truth: {verdict} by the "
+            f"{proven}. The pose, solved in {total:.1f} ms, is {angle} and {length} off the truth: {verdict} by the "
         )
         caption += f"limits of 1° and {limit}."
     return Frame(
@@ -159,7 +159,7 @@ def early_table(trace: Trace, judged: Judgement | None) -> Table:
     if trace.certificate is not None:
         rows += _certificate_rows(trace.certificate, explained)
     stages = ", ".join(f"{name} {value:.1f}" for name, value in trace.timings_ms.items() if name != "total")
-    rows.append(("time", f"{trace.timings_ms['total']:.1f} ms" + (f" ({stages})" if stages else "")))
+    rows.append(("solved in", f"{trace.timings_ms['total']:.1f} ms" + (f" ({stages})" if stages else "")))
     return Table("outcome", ("", "this run"), tuple(rows))
 
 

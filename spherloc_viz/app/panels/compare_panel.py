@@ -69,8 +69,8 @@ MEASURED = ("rotation", "position", "F1", "time")
 """Columns that have one in the table; the others are in the line below."""
 NOTE = (
     "One run each, one after another, all with the page's bound; the estimator that is chosen on the page has all of "
-    "the page's options, the others have default ones. Times are of this one run on this machine, busy with this page "
-    "too. Press a row to use its estimator."
+    "the page's options, the others have default ones. Times are of these runs, which are made for this table: the run "
+    "that the page shows has a time of its own. Press a row to use its estimator."
 )
 
 _warm: set[str] = set()

@@ -20,6 +20,8 @@ from spherloc_viz.layers import steps
 from spherloc_viz.recording.run_row import RunRow
 from spherloc_viz.recording.run_summary import outcome
 
+SOLVED = "solved in"
+"""What the time of a run is called. That of the same run made again is another one, and no difference of the two."""
 GROUND = "margin:0 .6em .4em;border:1px solid rgba(80,150,250,.45);border-radius:.4em"
 
 Line = tuple[str, str, str]
@@ -107,7 +109,7 @@ def lines_of(row: RunRow, run: Run, diagnosis: Diagnosis | None) -> list[Line]:
         ("diagnosis", escape(row.diagnosis or words.UNKNOWN), escape(cause)),
         ("errors", errors_of(row), errors_text(turn, shift, trace.problem.metric)),
         ("inliers", f"{row.inliers} of {row.correspondences}", f"{inliers} of {len(trace.problem)}"),
-        ("time", words.duration(row.time_ms), words.duration(trace.timings_ms["total"])),
+        (SOLVED, words.duration(row.time_ms), words.duration(trace.timings_ms["total"])),
     ]
 
 
@@ -130,7 +132,7 @@ def two_columns_html(lines: Sequence[Line], left: str, right: str) -> str:
     body = "".join(
         f'<tr><th scope="row" style="{cell};font-weight:400;white-space:nowrap;{DIM}">{name}</th>'
         f'<td style="{cell};width:45%">{one}</td>'
-        f'<td style="{cell};width:45%;{"font-weight:600" if one != other and name != "time" else ""}">{other}</td></tr>'
+        f'<td style="{cell};width:45%;{"font-weight:600" if one != other and name != SOLVED else ""}">{other}</td></tr>'
         for name, one, other in lines
     )
     css = "border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums"
@@ -220,7 +222,7 @@ def lines(one: RunRow, other: RunRow) -> list[Line]:
         ),
         ("inliers", f"{one.inliers} of {one.correspondences}", f"{other.inliers} of {other.correspondences}"),
         ("certificate", _proof(one), _proof(other)),
-        ("time", words.duration(one.time_ms), words.duration(other.time_ms)),
+        (SOLVED, words.duration(one.time_ms), words.duration(other.time_ms)),
     ]
     return shown
 

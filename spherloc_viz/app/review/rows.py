@@ -151,7 +151,8 @@ def picture_html(png: bytes, width_px: int = WIDTH_PX, height_px: int = HEIGHT_P
 
 
 def _hint(row: RunRow) -> str:
-    return escape(" ".join(filter(None, (row.summary or row.message, f"Seed {row.seed}, {row.file}."))))
+    solved = f"Solved in {words.duration(row.time_ms)} when it was recorded."
+    return escape(" ".join(filter(None, (row.summary or row.message, solved, f"Seed {row.seed}, {row.file}."))))
 
 
 def pages_html(look: Look, total: int, start: bool | None) -> str:
