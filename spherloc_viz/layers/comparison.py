@@ -53,8 +53,10 @@ SAMPLES = 120
 """Number of points of a residual curve."""
 SMALLER = 0.09
 """Cameras at one position are nested: each is smaller than the one before by this share of the first one's size."""
-SIZE, TOWER, STOREY = 1.9, 1.75, 0.7
-"""Size of the first camera, and heights of the lowest name and of each name above it, in sphere radii."""
+SIZE, TOWER, STOREY = 1.9, 1.75, 1.1
+"""Size of the first camera, and heights of the lowest label and of each label above it, in sphere radii."""
+ROW, NEAR = 3, 6.0
+"""Most names on a label, and the distance within which labels at one height would hide each other, in sphere radii."""
 LOWER = 0.07
 """Markers at one yaw differ in height: each is lower than the one before by this share of the first one's height."""
 
@@ -128,25 +130,47 @@ def _proof(certificate: Certificate) -> str:
 
 
 def comparison_items(entries: Sequence[Entry]) -> tuple[SceneItem, ...]:
-    """Every estimated camera in its estimator's colour, with its name on a mast."""
-    items: list[SceneItem] = []
-    masts: list[FloatArray] = []
-    for entry in entries:
-        if entry.trace.cam_from_map is None:
-            continue
+    """Every estimated camera in its estimator's colour, with its name on a mast; cameras that are not clearly apart
+    share a mast, with ``ROW`` names on a label."""
+    cameras: list[Segments] = []
+    groups: list[tuple[FloatArray, list[int]]] = []
+    found = [entry for entry in entries if entry.trace.cam_from_map is not None]
+    for number, entry in enumerate(found):
         view = RunView(entry.trace)
+        assert entry.trace.cam_from_map is not None
         pose, name = view.aligned_pose(entry.trace.cam_from_map), entry.trace.estimator
         centre = camera_centre(pose)
-        # Names of cameras that are not clearly apart are put one above the other.
-        below = sum(bool(np.linalg.norm(centre - other) < view.sphere_m) for other in masts)
-        masts.append(centre)
-        size_m = SIZE * view.sphere_m * max(0.3, 1.0 - SMALLER * below)
-        top = centre - np.array([0.0, (TOWER + STOREY * below) * view.sphere_m, 0.0])
-        mast = Segments("", "cameras", np.array([[centre, top]]), one_color(entry.color, 1), 0.0)
-        lines = camera(f"comparison/{name}", pose, size_m, entry.color, 2.5)
-        items.append(_joined(lines, mast))
-        items.append(Label(f"names/{name}", "cameras", top, name))
-    return tuple(items)
+        group = next((one for one in groups if np.linalg.norm(one[0] - centre) < view.sphere_m), None)
+        if group is None:
+            groups.append(group := (centre, []))
+        size_m = SIZE * view.sphere_m * max(0.3, 1.0 - SMALLER * len(group[1]))
+        group[1].append(number)
+        cameras.append(camera(f"comparison/{name}", pose, size_m, entry.color, 2.5))
+    labels: list[Label] = []
+    for centre, members in groups:
+        names = [found[number].trace.estimator for number in members]
+        sphere_m, color = RunView(found[members[0]].trace).sphere_m, found[members[0]].color
+        rows = [names[k : k + ROW] for k in range(0, len(names), ROW)]
+        for row in rows:
+            top = _free(centre - np.array([0.0, TOWER * sphere_m, 0.0]), labels, sphere_m)
+            labels.append(Label(f"names/{row[0]}", "cameras", top, ", ".join(row)))
+        mast = Segments("", "cameras", np.array([[centre, labels[-1].position]]), one_color(color, 1), 0.0)
+        cameras[members[0]] = _joined(cameras[members[0]], mast)
+    return (*cameras, *labels)
+
+
+def _free(place: FloatArray, labels: Sequence[Label], sphere_m: float) -> FloatArray:
+    """The lowest place (3,) for one more label, above or at a place (3,), at which no other hides it."""
+    reach_m, storey_m = NEAR * sphere_m, STOREY * sphere_m
+    near = [
+        label.position[1]
+        for label in labels
+        if np.hypot(*(label.position - place)[[0, 2]]) < reach_m  # -y is up
+    ]
+    for y in sorted(near, reverse=True):
+        if abs(place[1] - y) < storey_m:
+            place = np.array([place[0], y - storey_m, place[2]])
+    return place
 
 
 def _joined(one: Segments, other: Segments) -> Segments:

@@ -17,7 +17,7 @@ from spherloc_viz.layers.primitives import Label, SceneItem
 from spherloc_viz.layers.scene import camera
 from spherloc_viz.recording.run_row import RunRow
 
-SIZE, TOWER, STOREY = 1.55, 1.5, 0.5
+SIZE, TOWER, STOREY = 1.55, 1.5, 1.0
 """Size of a recorded camera, and heights of the lowest name and of each above it, in sphere radii."""
 SAME = 1e-9
 """Poses whose numbers differ by no more are one pose, which is drawn once."""
