@@ -51,7 +51,7 @@ def test_no_tab_tells_hidden_answers(office: Office) -> None:
     visitor.page.press(controls.compare._button)
     until(lambda: "diagnosis" in controls.compare._table.content or "success" in controls.compare._table.content)
     visitor.touch(f"run-open:{second}")
-    until(lambda: "review-card" in visitor.card._html.content and not visitor.opening)
+    until(lambda: "review-card" in visitor.card._places[0].content and not visitor.opening)
     until(lambda: controls.compare._button.label == "Compare")
     session._display.panels.steps.go("bearings")
     until(lambda: len(told(visitor)) > 10)

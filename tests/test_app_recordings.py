@@ -92,8 +92,8 @@ def test_a_run_is_recorded_with_its_origin_and_opened_exactly(office: Office) ->
     assert np.array_equal(session._run.trace.cam_from_map, recorded.cam_from_map)  # type: ignore[arg-type]
     assert np.array_equal(session._run.trace.problem.pixels, recorded.problem.pixels)
     assert session._controls.scene._simulation._outliers.value == 25.0
-    until(lambda: "2 of 2" in visitor.card._html.content and visitor.card._html.visible)
-    assert "runs-beside" not in visitor.card._html.content
+    until(lambda: "2 of 2" in visitor.card._places[0].content and visitor.card._places[0].visible)
+    assert "runs-beside" not in visitor.card._places[0].content
     assert len(office.files) == 2, "it is not recorded once more"
 
     # The next run by key, then what is changed shows both.
@@ -102,17 +102,17 @@ def test_a_run_is_recorded_with_its_origin_and_opened_exactly(office: Office) ->
     until(lambda: session._run is not None and session._run.request.scene.variation == origin.variation)
     visitor.touch("run-step:-1")
     until(lambda: "first run of the list" in visitor.panel._status.content)
-    until(lambda: "first run of the list" in visitor.card._html.content)
+    until(lambda: "first run of the list" in visitor.card._places[0].content)
     until(lambda: f"Opened {second}" in session._status._line.content)
     visitor.set(session._controls.scene._simulation._noise, 2.5)
-    until(lambda: "Changed: noise px" in visitor.card._html.content)
+    until(lambda: "Changed: noise px" in visitor.card._places[0].content)
     until(lambda: "recorded/0" in visitor.drawn and visitor.drawn["recorded/0"][0].visible)
-    assert "as recorded" in visitor.card._html.content
+    assert "as recorded" in visitor.card._places[0].content
     visitor.touch("run-return:")
     until(lambda: session._run is not None and session._run.request.scene.variation == origin.variation)
     until(lambda: not visitor.drawn["recorded/0"][0].visible)
     visitor.touch("run-close:")
-    until(lambda: not visitor.card._html.visible and visitor.card.opened is None)
+    until(lambda: not visitor.card._places[0].visible and visitor.card.opened is None)
 
 
 def test_nothing_is_compared_before_the_page_shows_the_recorded_run(
@@ -130,11 +130,11 @@ def test_nothing_is_compared_before_the_page_shows_the_recorded_run(
     visitor.see()
     until(lambda: f"run-open:{first}" in visitor.rows)
     visitor.touch(f"run-open:{first}")
-    until(lambda: "The page still shows another run." in visitor.card._html.content)
-    assert "runs-beside" not in visitor.card._html.content and "Changed" not in visitor.card._html.content
+    until(lambda: "The page still shows another run." in visitor.card._places[0].content)
+    assert "runs-beside" not in visitor.card._places[0].content and "Changed" not in visitor.card._places[0].content
     gate.set()
     until(lambda: session._run is not None and session._run.request.scene.variation == Variation())
-    until(lambda: "another run" not in visitor.card._html.content)
+    until(lambda: "another run" not in visitor.card._places[0].content)
 
 
 def test_labels_are_stored_and_seen_by_others(office: Office) -> None:

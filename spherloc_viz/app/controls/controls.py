@@ -202,24 +202,30 @@ class Controls:
         self.slow = SlowRun(gui, f"spherloc-clock-{client.client_id}")
         self._moves = gui.add_button_group("", (UNDO, REDO, NEW_SEED))
         self._moves.on_click(self._move)
-        self.review = ReviewCard(gui, owner.redraw)
+        self.review = ReviewCard(owner.redraw)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Play"):
+            self.review.stand(gui)
             self._build_play(gui, touches)
         with tabs.add_tab("Compare"):
+            self.review.stand(gui)
             gui.add_html(heading_html("Several estimators on this problem", "estimator"))
             self.compare = ComparePanel(gui, touches, owner.use_estimator, owner.redraw, owner.prepare_estimator)
         with tabs.add_tab("Sweep"):
+            self.review.stand(gui)
             gui.add_html(heading_html("From where on does an estimator fail?", "sweep"))
             self._sweep = SweepPanel(gui, touches, self._chosen_sweep, services.recorder)
         with tabs.add_tab("Open"):
+            self.review.stand(gui)
             gui.add_html(heading_html("Other scenes, and matches of your own", "scene"))
             self._open = OpenPanel(gui, client, touches, services.roots, self._open_scene, self._scene_file)
         with tabs.add_tab("Recordings"):
+            self.review.stand(gui)
             gui.add_html(heading_html("Recorded runs, and a gallery of failures", "recording"))
             page = RecordingsPage(services.roots, self._enter, owner.open, owner.open_recorded, services.downloads)
             self._recordings = RecordingsPanel(gui, client, touches, services.library, self.review, page)
         with tabs.add_tab("Share"):
+            self.review.stand(gui)
             self._export = ExportPanel(gui, client, owner.shown)
         undo: Any = gui.add_command(UNDO, hotkey="Z", modifier="cmd/ctrl")
         redo: Any = gui.add_command(REDO, hotkey="Z", modifier="cmd/ctrl+shift")

@@ -25,18 +25,23 @@ from spherloc_viz.recording.run_row import RunRow
 
 
 class ReviewCard:
-    """Shows nothing until a recorded run is opened."""
+    """Shows nothing until a recorded run is opened. It stands in every tab of a panel, of which one is seen: above the
+    tabs it would move them when it comes."""
 
-    def __init__(self, gui: viser.GuiApi, redraw: Callable[[], None]) -> None:
+    def __init__(self, redraw: Callable[[], None]) -> None:
         """``redraw`` has the page drawn anew."""
         self._redraw = redraw
-        self._html = gui.add_html("", visible=False)
+        self._places: list[viser.GuiHtmlHandle] = []
         self._opened: Opened | None = None
         self._lock = threading.Lock()
         self._where: tuple[int | None, int] = (None, 0)
         self._said = ("", False)
         self._reached: Path | None = None
         """File of the recorded run that the page has shown."""
+
+    def stand(self, gui: viser.GuiApi) -> None:
+        """Stand here too, in the container that is built."""
+        self._places.append(gui.add_html("", visible=False))
 
     @property
     def opened(self) -> Opened | None:
@@ -82,8 +87,8 @@ class ReviewCard:
                 self._reached = opened.path
             reached = self._reached == opened.path
             html = untold_html(opened, run, bar) if hidden else card_html(opened, run, diagnosis, bar, reached)
-        update_widget(self._html, content=html)
-        self._html.visible = bool(html)
+        for widget in self._places:
+            update_widget(widget, content=html, visible=bool(html))
 
     def items(self, run: Run) -> tuple[SceneItem, ...]:
         """What the canvas shows beside a run."""
