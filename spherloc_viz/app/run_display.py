@@ -73,6 +73,8 @@ class Places:
     """The scene with images of that label, if it is one."""
 
 
+PROJECTED = 1.7
+"""How many times as large labels are in the projector view: they are read from the last row."""
 BALLS_STEP = "clique"
 """The step to which the view "Balls" goes from one that shows none."""
 
@@ -106,6 +108,7 @@ class RunDisplay:
         self._theme = START_THEME
         self._redraw = places.redraw
         touches.on("reveal", self._reveal)
+        touches.on("projector", self._project)
 
     def withheld(self, run: Run) -> frozenset[str]:
         """Which of ``ANSWERS`` this page hides of a run."""
@@ -123,6 +126,10 @@ class RunDisplay:
             told = self._told(run) | ANSWERS & {touch.argument}
             self._revealed = run, self.controls.display.times_hidden, told
             self._redraw(touch)
+
+    def _project(self, touch: Touch) -> None:
+        """Begin the projector view, whose panel the page has widened; 0 ends it."""
+        self.canvas.enlarge_labels(1.0 if touch.argument == "0" else PROJECTED)
 
     def open_map(self, label: str, scene: MapScene, mesh: bytes | None) -> None:
         """Until a run of this scene is drawn, show its map in place of the run at hand."""

@@ -49,7 +49,7 @@ class Canvas:
         """
         client.scene.set_up_direction("-y")
         self._client, self._display = client, display
-        self._label_scale = LABEL_SCALE * text_scale(client.camera.image_width)
+        self._usual_scale = self._label_scale = LABEL_SCALE * text_scale(client.camera.image_width)
         self._painter = Painter(client, picked, self._label_scale)
         self._camera = TrueCamera(client, moved)
         self._full_width = client.camera.image_width
@@ -112,6 +112,13 @@ class Canvas:
         *numbers, degrees = viewpoint
         self._held = step_key, views.Viewpoint(np.array(numbers[:3]), np.array(numbers[3:]), np.radians(degrees))
         self._looked, self._held_step_came = None, False
+
+    def enlarge_labels(self, factor: float) -> None:
+        """Draw labels so many times as large as usual, and fit the view to them."""
+        with self._lock:
+            self._label_scale = factor * self._usual_scale
+            self._painter.scale_labels(self._label_scale)
+        self._follow_page()
 
     def fill_page(self) -> None:
         """Use the whole page for the canvas, without panels, as in a lesson."""

@@ -162,6 +162,14 @@ class Painter:
             self._follow()
         self._shown = tuple(shown)
 
+    def scale_labels(self, scale: float) -> None:
+        """Draw labels in this size, relative to viser's own, from now on."""
+        self._label_scale = scale
+        with self._client.atomic():
+            for handle, _, item in self._drawn.values():
+                if isinstance(item, Label):
+                    update_node(handle, font_screen_scale=scale)
+
     def hide(self, names: frozenset[str]) -> None:
         """Do not show these nodes from now on; an empty set shows all again."""
         if names != self.hidden:

@@ -2,12 +2,12 @@
 // the settings are folded away at the start; on a narrow one what the step says stands below the canvas, with Previous
 // and Next, and with it what is said of a match that was tapped and, at the last step, of a failure. The projector view,
 // key L or an element of the class "projector-toggle", folds the panel on the right and has the view that goes with the
-// step and, in large type, what the step says on the left, for which it asks the server for room (projector:WIDTH of the
-// window). At either end of the steps the button that leads on is disabled, in the panel too.
+// step and, in large type, what the step says and at the last one what is said of a failure on the left, for which it
+// asks the server for room (projector:WIDTH of the window). At either end of the steps the button that leads on is disabled, in the panel too.
 (() => {
-  const EVERY_MS = 150, NARROW_PX = 600, ROOMY_PX = 1000, FOLD = "Collapse panel area", UNFOLD = "Expand column";
+  const EVERY_MS = 150, FOLDED_MS = 2000, NARROW_PX = 600, ROOMY_PX = 1000, FOLD = "Collapse panel area", UNFOLD = "Expand column";
   const DESELECT = '<button class="deselect" data-touch="deselect:">Deselect</button>';
-  let bar = null, words = null, projector = false, folded = false, roomMade = false, toldWidth = 0;
+  let bar = null, words = null, projector = false, folded = false, roomMade = false, toldWidth = 0, toggledAt = -Infinity;
 
   // While the settings are unfolded on a narrow screen, they take it all.
   const small = () => innerWidth < NARROW_PX;
@@ -49,7 +49,7 @@
   // Only what is new is written: a screen reader would read it again.
   function fill() {
     const told = [".match-words", ".step-words", ".diagnosis-words"]
-      .filter((kind) => narrow() || kind === ".step-words")
+      .filter((kind) => narrow() || kind !== ".match-words")
       .map((kind) => [kind, document.querySelector(kind)?.innerHTML])
       .filter(([, html]) => html)
       .map(([kind, html]) => `<div class="of-${kind.slice(1)}">${html}${kind === ".match-words" ? DESELECT : ""}</div>`)
@@ -88,6 +88,7 @@
       rightmost(UNFOLD)?.click();
       folded = false;
     }
+    toggledAt = performance.now();
     look();
   }
 
@@ -132,6 +133,11 @@
   }
 
   setInterval(look, EVERY_MS);
+  // viser gives the focus, and its frame, to the panel that was folded or unfolded: nobody has asked for that.
+  for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, () => { toggledAt = -Infinity; }, true);
+  addEventListener("focusin", ({ target }) => {
+    if (performance.now() - toggledAt < FOLDED_MS && target instanceof HTMLElement && !bar?.contains(target)) target.blur();
+  }, true);
   addEventListener("keydown", (event) => {
     const writing = event.target instanceof Element
       && event.target.closest("input:not([type=checkbox]):not([type=radio]),textarea,select,[contenteditable=true]");
