@@ -337,7 +337,7 @@ class YawView:
         note = escape(UNTOLD if hidden else caption(trace, story, arcs, bars))
         content = box(
             f'<div style="font-weight:600;padding-bottom:.3em">{escape(story.title)}{help_html("arc")}</div>'
-            f"{yaw_svg(story, bars, window, kept, shown_key)}"
+            f"{bars_html(bars)}{yaw_svg(story, bars, window, kept, shown_key)}"
             f'<div style="font-size:12px;opacity:.7;padding-top:.3em">{note}</div>'
         )
         update_widget(self._html, content=content)
@@ -392,8 +392,20 @@ def _window_of(argument: str) -> Window | None:
     return (low, high) if sensible else None
 
 
+def bars_html(bars: ArcBars) -> str:
+    """What the colours of the bars that are drawn mean; empty without bars."""
+    kinds = np.unique(bars.kind[bars.owner[bars.row >= 0]]).tolist()
+    samples = "".join(
+        f'<span style="white-space:nowrap"><svg width="16" height="8"><path d="M0 0h16v8H0z" {LOOKS[kind]}/></svg>'
+        f" {KINDS[kind]}</span>"
+        for kind in kinds
+    )
+    look = "font-size:12px;display:flex;flex-wrap:wrap;column-gap:.9em;padding-bottom:.2em"
+    return f'<div style="{look}">pairs: {samples}</div>' if kinds else ""
+
+
 def caption(trace: Trace, story: YawStory, arcs: PairArcs, bars: ArcBars) -> str:
-    """The caption: which arcs are shown, by which rule, and the meaning of their colours."""
+    """The caption: which arcs are shown, and by which rule."""
     total = sum(bars.total)
     if total == 0:
         return " ".join(filter(None, (story.note, arcs.rule, "No pair has an arc in this window.")))
@@ -407,7 +419,6 @@ def caption(trace: Trace, story: YawStory, arcs: PairArcs, bars: ArcBars) -> str
         counts = ", ".join(f"{of:,} {name}" for of, name in zip(bars.total, KINDS, strict=True))
         rule = f"All {total:,} arcs" if total > 1 else "The only arc"
         rule = f"{rule} in this window shown: {counts}."
-    judged = right_ones(trace)[1]
-    colors = f"Green: both matches right {judged}; red: both wrong; faint red: one wrong."
+    colors = f"Right or wrong {right_ones(trace)[1]}."
     joined = "Violet lines join the two arcs of one pair." if (bars.chosen & (bars.count > 1)).any() else ""
     return " ".join(filter(None, (story.note, arcs.rule, rule, colors, joined)))

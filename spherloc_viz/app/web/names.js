@@ -2,7 +2,7 @@
 // buttons that are only a picture, and the canvas. What scrolls but has nothing to go to by key can be gone to itself.
 (() => {
   const EVERY_MS = 300, CANVAS = "The scene in three dimensions; the steps beside it say what it shows";
-  const PICTURES = { "list-search": "Search the commands", "adjustments-horizontal": "Settings of the canvas" };
+  const PICTURES = { "list-search": "Search the commands" };
   const set = (one, name, value) => { if (one.getAttribute(name) !== value) one.setAttribute(name, value); };
 
   function nameFields() {
