@@ -16,7 +16,7 @@ for (const kind of [WebGLRenderingContext, WebGL2RenderingContext])
         if (kind.prototype[name]) kind.prototype[name] = () => undefined;
 """
 MEASURE = """async thumb => {
-    const outcome = [...document.querySelectorAll("td")].find(cell => cell.textContent === "time").closest("div");
+    const outcome = [...document.querySelectorAll("td")].find(cell => cell.textContent === "solved in").closest("div");
     const place = outcome.parentElement;
     thumb.focus();
     const start = performance.now();

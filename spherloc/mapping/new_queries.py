@@ -6,6 +6,7 @@ from typing import Any
 
 from spherloc.datasets.scene_file import read_table, section
 from spherloc.errors import InputError, StoppedError, reason
+from spherloc.files import is_folder
 from spherloc.formats.colmap_files import read_model
 from spherloc.frontend.view import View
 from spherloc.mapping.photographs import Photographs, cameras_of, new_images_of, with_cameras
@@ -21,7 +22,7 @@ def map_images(scene: Path) -> Path | None:
     Raises ``InputError`` for a file that is no scene file.
     """
     own = _map_of(read_table(scene))
-    return None if own is None or not (scene.parent / MODEL).is_dir() else scene.parent / own["images"]
+    return None if own is None or not is_folder(scene.parent / MODEL) else scene.parent / own["images"]
 
 
 def _map_of(table: Mapping[str, Any]) -> Mapping[str, Any] | None:
