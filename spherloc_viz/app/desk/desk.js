@@ -16,7 +16,7 @@ const NEWS_MS = 15000;
 const STRIP_WORDS = "Runs whose value is unknown lie in the shaded strip.";
 const START = {
   search: "", chosen: {}, ranges: {}, lasso: null, only: null, pages: false, sort: "created", descending: true,
-  columns: ["outcome", "diagnosis", "scene", "estimator", "outlier_rate", "rotation_error_deg", "translation_error_m", "position_sd_m", "certificate_gap", "time_ms", "labels"],
+  columns: ["outcome", "diagnosis", "outlier_rate", "rotation_error_deg", "translation_error_m", "scene", "estimator", "position_sd_m", "certificate_gap", "time_ms", "labels"],
   x: "outlier_rate", y: "rotation_error_deg", rows: "diagnosis", across: "scene", keys: DEFAULT_KEYS,
 };
 const byId = (id) => document.getElementById(id);
@@ -351,7 +351,10 @@ function mark(i) {
 }
 
 function drawTools() {
-  byId("listed").textContent = marked.size ? `${plural(marked.size, "run")} marked` : "";
+  // The side of the chosen run takes no room before there is one.
+  document.body.classList.toggle("unchosen", chosen < 0);
+  const hint = chosen < 0 && listed.length ? "Choose a run: click a row, or press ↓." : "";
+  byId("listed").textContent = marked.size ? `${plural(marked.size, "run")} marked` : hint;
   byId("mark-all").textContent = `Mark all ${count(listed.length)} listed`;
   byId("mark-all").disabled = !listed.length;
   byId("mark-none").hidden = !marked.size;
