@@ -196,6 +196,14 @@ def test_words_move_and_change_in_place(painter: Painter, canvas: Canvas) -> Non
     assert not canvas.shown
 
 
+def test_words_grow_for_a_lecture(painter: Painter, canvas: Canvas) -> None:
+    painter.draw([Label("scale/length", "scale bar", np.zeros(3), "1 m"), dots(3)], ALL)
+    painter.scale_labels(2.5)
+    assert canvas.nodes["/scale/length"].font_screen_scale == 2.5
+    painter.draw([Label("sphere/name", "sphere", np.zeros(3), "unit sphere")], ALL)
+    assert canvas.nodes["/sphere/name"].font_screen_scale == 2.5
+
+
 def test_a_rim_shows_its_back_only(painter: Painter, canvas: Canvas) -> None:
     """So that the dot inside stays in sight."""
     for name, rim in (("halo", True), ("dot", False)):

@@ -29,9 +29,18 @@ def test_the_projector_view_says_each_step_in_large_type(browser: Browser, addre
     box, room = captions.bounding_box(), tab.page.viewport_size
     assert box is not None and room is not None and box["y"] > 0 and box["y"] + box["height"] <= room["height"] + 1
 
+    # What is said of a failure is said there too.
     tab.page.keyboard.press("l")
     expect(captions).to_have_count(0)
     expect(tab.page.get_by_role("tab", name="Play", exact=True)).to_be_visible()
+    tab.until(lambda: tab.page.evaluate("document.activeElement === document.body"), "no frame of a focus stays")
+    tab.slide("Outliers (%)", "End")
+    expect(tab.page.get_by_text(re.compile("^Judged with"))).to_be_visible()
+    tab.page.keyboard.press("l")
+    cause = str(tab.page.locator(".diagnosis-words > div").first.inner_text())
+    expect(captions).to_contain_text(cause)
+    tab.page.keyboard.press("l")
+    expect(captions).to_have_count(0)
     # The key is known also where a box was ticked last.
     tab.widget("Dark").focus()
     tab.page.keyboard.press("l")

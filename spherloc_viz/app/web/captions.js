@@ -136,7 +136,8 @@
   // viser gives the focus, and its frame, to the panel that was folded or unfolded: nobody has asked for that.
   for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, () => { toggledAt = -Infinity; }, true);
   addEventListener("focusin", ({ target }) => {
-    if (performance.now() - toggledAt < FOLDED_MS && target instanceof HTMLElement && !bar?.contains(target)) target.blur();
+    const given = performance.now() - toggledAt < FOLDED_MS && target instanceof HTMLElement && !bar?.contains(target);
+    if (given && !target.matches("input,textarea,[role=slider]")) target.blur();
   }, true);
   addEventListener("keydown", (event) => {
     const writing = event.target instanceof Element
