@@ -21,7 +21,7 @@ from spherloc.estimators.mc import WIDEST_RAD
 from spherloc.geometry import yaw_rotation
 from spherloc.problem import Problem
 from spherloc.trace import RansacStage, Trace, YawStage
-from spherloc_viz.app.plots.yaw_view import PEAK, WHOLE, YawView, yaw_svg
+from spherloc_viz.app.plots.yaw_view import PEAK, WHOLE, YawView, bars_html, yaw_svg
 from spherloc_viz.app.server import start_viser, stop_viser
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers import paint, steps
@@ -194,6 +194,15 @@ def test_samples_are_even_and_hold_no_index_twice(count: int, most: int) -> None
 )
 def test_windows_begin_on_the_circle(middle: float, width: float, window: Window) -> None:
     assert window_around(middle, width) == pytest.approx(window)
+
+
+def test_a_legend_has_the_colours_of_the_bars_that_are_drawn(runs: dict[str, Trace]) -> None:
+    run = runs["mc"]
+    bars = bars_in(run, arcs_of(run, ()), ALL, ())
+    assert all(word in bars_html(bars) for word in KINDS)
+    right = replace(bars, kind=np.zeros_like(bars.kind))
+    assert KINDS[0] in bars_html(right) and KINDS[1] not in bars_html(right)
+    assert bars_html(replace(bars, row=np.full_like(bars.row, -1))) == ""
 
 
 def test_the_peak_is_in_its_window(runs: dict[str, Trace]) -> None:

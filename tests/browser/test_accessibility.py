@@ -52,7 +52,7 @@ def test_every_state_of_the_page_is_accessible(browser: Browser, address: str) -
     expect(tab.page.locator("html[data-mantine-color-scheme=light]")).to_have_count(1)
     tab.tab("Recordings")
     tab.page.locator("[data-touch^='run-open:']").locator("visible=true").first.click()
-    expect(tab.page.locator(".review-card")).to_be_visible()
+    expect(tab.page.locator(".review-card").locator("visible=true")).to_be_visible()
     tab.tab("Residuals")
     assert faults(tab) == []
     tab.tab("Play")

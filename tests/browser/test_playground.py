@@ -27,6 +27,14 @@ def test_page_shows_a_localization_and_talks_to_nobody_else(tab: Playground, add
     expect(tab.page.get_by_text("Diagnosing …")).to_have_count(0)
     expect(tab.page.get_by_text(re.compile("^Judged with"))).to_have_count(0)
 
+    # What a control says stands beside its panel, and viser's own settings are not offered.
+    expect(tab.page.locator(".tabler-icon-adjustments")).not_to_be_visible()
+    tab.thumb("Noise (px)").hover()
+    hint, label = tab.page.get_by_role("tooltip"), tab.page.locator("label", has_text="Noise (px)")
+    expect(hint).to_be_visible()
+    told, panel = hint.bounding_box(), label.bounding_box()
+    assert told is not None and panel is not None and told["x"] + told["width"] < panel["x"]
+
     # The numbers follow the slider; a doubtful run is diagnosed and a good one is not.
     tab.slide("Outliers (%)", "End")
     expect(tab.value("inliers")).to_have_text(re.compile(r"^\d of 40$"))

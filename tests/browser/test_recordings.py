@@ -80,8 +80,11 @@ def test_failures_are_gone_through(tab: Playground, own_address: str, folder: Pa
     expect(rows(tab)).to_have_count(2)
 
     # One is opened exactly as it was.
+    tabs = tab.page.get_by_role("tab", name="Recordings", exact=True)
+    before = tabs.bounding_box()
     rows(tab).nth(1).click()
     expect(said(tab, f"^Opened {re.escape(first)}")).to_be_visible()
+    assert tabs.bounding_box() == before, "the tabs stay under the pointer"
     expect(tab.value("inliers")).to_have_text(f"{inliers[first]} of 40")
     expect(said(tab, "2 of 2")).to_be_visible()
     tab.tab("Play")
@@ -91,7 +94,7 @@ def test_failures_are_gone_through(tab: Playground, own_address: str, folder: Pa
     # Something is changed, and both are seen.
     tab.slide("Noise (px)", "Home")
     expect(said(tab, "^Changed: noise px")).to_be_visible()
-    expect(tab.page.locator("table.runs-beside")).to_contain_text("as recorded")
+    expect(tab.page.locator("table.runs-beside").locator("visible=true")).to_contain_text("as recorded")
     tab.until(lambda: tab.node("/recorded/0") is not None, "the recorded camera is drawn")
     third = recorded(tab)
     tab.until(lambda: (recordings / third).exists(), "the changed run is on the disk")
