@@ -133,7 +133,7 @@ def review(page: Page) -> None:
     label = page.locator("label", has_text=re.compile("^Search$"))
     label.locator("xpath=ancestor::*[contains(@class, 'Flex-root')][1]").locator("input").fill("false consensus")
     page.locator("[data-touch^='run-open:gallery/larger-false-consensus']").first.click()
-    page.locator("[data-touch='run-close:']").first.wait_for()
+    page.locator("[data-touch='run-close:'] >> visible=true").first.wait_for()
 
 
 def sequence(page: Page) -> None:
