@@ -65,6 +65,17 @@ def test_edges_are_the_overlaps_and_the_clique_is_a_block(mc: Trace) -> None:
     assert gold[: nodes.clique, : nodes.clique].all() and gold.sum() == nodes.clique**2
 
 
+def test_every_graph_of_balls_leads_to_the_clique(mc: Trace, exact: Trace) -> None:
+    kept = np.arange(len(mc.problem))
+    for key, graph in graphs(mc).items():
+        at_clique = graph.color == style.CLIQUE
+        assert ('data-touch="step:clique"' in graph_html(graph, (), kept)) != at_clique, key
+        assert "step:clique" not in graph_html(graph, (), kept, hidden=True)
+    found = graphs(mc)
+    assert found["clique"].color == style.CLIQUE != found["balls-pair"].color
+    assert not any("step:clique" in graph_html(graph, (), kept) for graph in graphs(exact).values())
+
+
 def test_matches_that_agree_have_an_arc_over_the_yaw(exact: Trace) -> None:
     stage, graph = exact.stage(ConsensusStage), graphs(exact)["consensus-clique"]
     assert stage is not None

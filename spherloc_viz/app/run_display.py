@@ -20,6 +20,7 @@ from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.left_panels import LeftPanels
 from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
+from spherloc_viz.app.plots.graph_view import CLIQUE_STEP
 from spherloc_viz.app.stage.canvas import Canvas, text_scale
 from spherloc_viz.app.text import diagnosis_html, hidden_html, key_step_html, status_html, summary_of
 from spherloc_viz.app.web.touch import Touch, Touches
@@ -75,8 +76,6 @@ class Places:
 
 PROJECTED = 1.7
 """How many times as large labels are in the projector view: they are read from the last row."""
-BALLS_STEP = "clique"
-"""The step to which the view "Balls" goes from one that shows none."""
 
 
 class RunDisplay:
@@ -171,8 +170,8 @@ class RunDisplay:
         timeline = steps(trace, told)
         at_hand = self._shown[2].step.stage if self._shown is not None else ""
         balls = controls.display.wanted_view == "Balls" and at_hand != "Translation"
-        if balls and any(step.key == BALLS_STEP for step in timeline):
-            self.panels.steps.go(BALLS_STEP)
+        if balls and any(step.key == CLIQUE_STEP for step in timeline):
+            self.panels.steps.go(CLIQUE_STEP)
         index, pause = self.panels.steps.advance(timeline, asked)
         picture, last = paint(trace, index, told), index == len(timeline) - 1
         diagnosis = None if hidden else diagnosis

@@ -174,8 +174,8 @@ def _filters(rows: MatchColumns, look: TableLook) -> str:
     chips = []
     for name in offered(rows):
         count = np.count_nonzero(FILTERS[name](rows))
-        of_balls = " of balls" if name == IN_CLIQUE and rows.of_balls else ""
-        chips.append(chip(f"{name}{of_balls} {count:,}", f"match-filter:{name}", name == look.shown))
+        words = f"matches {name} of balls" if name == IN_CLIQUE and rows.of_balls else name
+        chips.append(chip(f"{words} {count:,}", f"match-filter:{name}", name == look.shown))
     return "".join(chips)
 
 

@@ -23,6 +23,8 @@ from spherloc_viz.layers.matches import IN_CLIQUE
 from spherloc_viz.layers.primitives import BallRows, Graph
 
 CELL, LOOK = "graph-cell", "graph-look"
+CLIQUE_STEP = "clique"
+"""Key of the step that shows the maximum clique of balls."""
 LIST = "list"
 LOOKS = ("drawing", LIST)
 """Looks of the panel where nodes are balls."""
@@ -265,13 +267,15 @@ class GraphView:
         elif graph is None:
             content = _waiting_html(begins)
         elif graph.list_balls is not None and self.look == LIST:
-            content = self._list_html(graph, graph.list_balls(), selected, kept)
+            content = self._list_html(graph, graph.list_balls(), selected, kept, hidden)
         else:
-            content = graph_html(graph, selected, kept)
+            content = graph_html(graph, selected, kept, hidden)
         self._drawn = (*drawn[:-1], self._page)
         update_widget(self._html, content=content)
 
-    def _list_html(self, graph: Graph, rows: BallRows, selected: tuple[int, ...], kept: NDArray[np.int64]) -> str:
+    def _list_html(
+        self, graph: Graph, rows: BallRows, selected: tuple[int, ...], kept: NDArray[np.int64], hidden: bool
+    ) -> str:
         """The list; if a ball was just selected elsewhere, it turns to its page."""
         lit = selected_rows(rows, selected)
         self._page = min(self._page, (len(rows.radii) - 1) // PAGE)
@@ -280,7 +284,7 @@ class GraphView:
             self._page = page_of(lit, self._page)
         whole = graph.color == style.CLIQUE and np.count_nonzero(graph.marked) == graph.nodes.clique
         marks = "in the clique" if whole else "marked"
-        words = f'<div style="padding-bottom:.2em">{linked(graph.words)}</div>'
+        words = f'<div style="padding-bottom:.2em">{linked(graph.words)}{_clique_html(graph, hidden)}</div>'
         return box(_title(graph, LIST) + words + ball_list_html(rows, self._page, lit, kept, graph.color, marks))
 
     def _choose(self, touch: Touch) -> None:
@@ -301,14 +305,13 @@ class GraphView:
         self._select(tuple(np.unique(graph.nodes.matches[nodes]).tolist()))
 
 
-def graph_html(graph: Graph, selected: tuple[int, ...], kept: NDArray[np.int64]) -> str:
+def graph_html(graph: Graph, selected: tuple[int, ...], kept: NDArray[np.int64], hidden: bool = False) -> str:
     """Both drawings, with a description of what they show."""
     lit, edges = graph.nodes.lit(selected), edges_of(graph)
     lit = lit[graph.shown[lit]]
     chosen = chosen_words(graph, lit, kept)
-    words = "".join(
-        f'<div style="padding-top:.4em">{said}</div>' for said in (linked(graph.words), escape(chosen)) if said
-    )
+    about = linked(graph.words) + _clique_html(graph, hidden)
+    words = "".join(f'<div style="padding-top:.4em">{said}</div>' for said in (about, escape(chosen)) if said)
     note = f'<div style="font-size:12px;opacity:.75;padding-top:.3em">{escape(graph_note(graph, edges))}</div>'
     return box(_title(graph, LOOKS[0]) + graph_svg(graph, edges, lit, kept) + words + note)
 
@@ -321,6 +324,13 @@ def _title(graph: Graph, look: str) -> str:
         chips = "".join(chip(name, f"{LOOK}:{one}", one == look) for one, name in zip(LOOKS, names, strict=True))
     title = f'<span style="font-weight:600;margin-right:auto">Graph and matrix{help_html("graph")}</span>'
     return f'<div style="display:flex;flex-wrap:wrap;align-items:baseline">{title}{chips}</div>'
+
+
+def _clique_html(graph: Graph, hidden: bool) -> str:
+    """A link to the step of the clique of balls, where another one is shown; none while what came out is ``hidden``."""
+    if hidden or graph.list_balls is None or graph.color == style.CLIQUE:
+        return ""
+    return f' <span class="term" role="button" tabindex="0" data-touch="step:{CLIQUE_STEP}">Go to the clique</span>.'
 
 
 def _waiting_html(begins: str) -> str:
