@@ -121,7 +121,8 @@ def _listed(graph: Graph) -> list[str]:
     if graph.color != style.CLIQUE or not graph.marked.any():
         return []
     count = len(np.unique(graph.nodes.matches[graph.marked]))
-    return [f'Marked: nodes of {count:,} matches. The Matches tab lists all members ("{IN_CLIQUE}").']
+    first = "The list above has the balls of the clique first. " if graph.list_balls is not None else ""
+    return [f'{first}Marked: nodes of {count:,} matches, which the Matches tab lists ("{IN_CLIQUE}").']
 
 
 def _many(name: str) -> str:
