@@ -24,8 +24,7 @@ def fill_rows(count: int, each: int, arrays: tuple[NDArray, ...], fill: Fill) ->
     ``arrays`` have room for ``each`` entries a pair. ``fill`` gets the part of them that the pairs of its rows have,
     and must not hold the interpreter's lock.
     """
-    before = np.arange(count) * (2 * count - 1 - np.arange(count)) // 2
-    """Pairs of the rows before each row."""
+    before = np.arange(count) * (2 * count - 1 - np.arange(count)) // 2  # pairs of the rows before each row
     pairs, threads = count * (count - 1) // 2, min(MAX_THREADS, processor_count())
     parts = PARTS_A_THREAD * threads if pairs >= MIN_PAIRS and threads > 1 else 1
     rows = [0, *np.searchsorted(before, np.arange(1, parts) * pairs / parts).tolist(), count]
