@@ -24,6 +24,7 @@ from spherloc.geometry import DOWN, rotation_angle
 from spherloc.mapping.guided import guided_matches
 from spherloc.mapping.level_pairs import chance_of_fit, fitting, level_pair, log10_nfa
 from spherloc.mapping.rotations import OFF_RAD
+from spherloc.mapping.telling import below_sky, far_matches, unmoved
 from spherloc.mapping.triangles import MIN_FIT, Pair, Relative, elsewhere, through
 from spherloc.types import BoolArray, FloatArray
 
@@ -44,6 +45,11 @@ MANY_FIT, MIN_RATIO = 55, 1.0 / 3.0
 """Two panoramas with fewer matches that fit than the first number, and a ``Spread.ratio`` below the second, may show
 one thing that stands at two places: so it is with all pairs whose pose is wrong in a rendered flat of rooms alike, and
 with few of the others."""
+FAR = 1.0 / 3.0
+"""Share of the matches that fit a rotation alone, from which on they may hide where the camera went."""
+CLEARLY = 2.0
+"""A pose is better than another if this many times as many of the matches that tell it fit; clouds may have made a pose
+if this many times as many of the matches above the horizon fit it as of the others."""
 MAX_LOG10_NFA = -1.0
 """Largest log10 of the NFA: the number of poses that as many of the matches would fit by chance."""
 
@@ -132,14 +138,57 @@ class ImagePairs:
     def _geometry(self, first: int, second: int, pairs: NDArray[np.uint32]) -> Any:
         if len(pairs) < MIN_MATCHES:
             return None
-        rays = self._bearings[first][pairs[:, 0]], self._bearings[second][pairs[:, 1]]
-        level = level_pair(*rays, (self._down(first), self._down(second)), LEVEL_BOUND_RAD)
+        rays = self._rays(first, second, pairs)
+        geometry = max(self._poses(first, second, pairs), key=lambda one: len(one.inlier_matches), default=None)
+        if geometry is not None and not self._no_chance(geometry, *rays):
+            geometry = None
+        telling = self._telling(first, second, rays, geometry)
+        if telling is None:
+            return geometry
+        seen = rays[0][telling], rays[1][telling]
+        fits = 0 if geometry is None else self._support(geometry, *seen)
+        other = max(self._poses(first, second, pairs[telling]), key=lambda one: self._support(one, *seen), default=None)
+        if other is not None and self._support(other, *seen) >= CLEARLY * fits and self._no_chance(other, *seen):
+            return other
+        return geometry if geometry is not None and self._more_than_chance(geometry, *seen) else None
+
+    def _telling(self, first: int, second: int, rays: tuple[FloatArray, FloatArray], geometry: Any) -> BoolArray | None:
+        """Mask (M,) of the bearings (M, 3) that show where the camera went, if clouds or other far things may hide it;
+        None if they do not, or if all matches are theirs."""
+        far = far_matches(*rays, self._bound_rad)
+        known = all(
+            self._gravity[one] is not None or isinstance(self._cameras[one], Equirectangular) for one in (first, second)
+        )
+        low = below_sky(*rays, (self._down(first), self._down(second))) if known else np.ones(len(far), np.bool_)
+        telling = low & ~far
+        if np.count_nonzero(telling) < MIN_MATCHES:
+            return None
+        hidden = bool(far.mean() >= FAR)
+        if not hidden and geometry is not None and np.count_nonzero(~low) >= MIN_MATCHES:
+            shares = [
+                self._support(geometry, rays[0][some], rays[1][some]) / np.count_nonzero(some) for some in (low, ~low)
+            ]
+            hidden = CLEARLY * shares[0] < shares[1]
+        return telling if hidden else None
+
+    def _support(self, geometry: Any, first: FloatArray, second: FloatArray) -> int:
+        """How many of the bearings (M, 3) fit."""
+        rotation, direction = relative(geometry)
+        if self.same_place(geometry):
+            return int(np.count_nonzero(unmoved(first, second, rotation, self._bound_rad)))
+        return int(np.count_nonzero(fitting(first, second, rotation, direction, self._bound_rad)))
+
+    def _rays(self, first: int, second: int, pairs: NDArray[np.uint32]) -> tuple[FloatArray, FloatArray]:
+        """Bearings of matches (M, 2) in both images, each (M, 3)."""
+        return self._bearings[first][pairs[:, 0]], self._bearings[second][pairs[:, 1]]
+
+    def _poses(self, first: int, second: int, pairs: NDArray[np.uint32]) -> list[Any]:
+        """Usable ``TwoViewGeometry`` of matches (M, 2), and of those of them that fit two level cameras."""
+        level = level_pair(*self._rays(first, second, pairs), (self._down(first), self._down(second)), LEVEL_BOUND_RAD)
         found = [self._estimated(first, second, pairs)]
         if level is not None and np.count_nonzero(level.fits) >= MIN_MATCHES:
             found.append(self._estimated(first, second, pairs[level.fits]))
-        found = [one for one in found if self._usable(one) and self._level(first, second, one)]
-        geometry = max(found, key=lambda one: len(one.inlier_matches), default=None)
-        return geometry if geometry is not None and self._no_chance(geometry, *rays) else None
+        return [one for one in found if self._usable(one) and self._level(first, second, one)]
 
     def _down(self, index: int) -> FloatArray:
         gravity = self._gravity[index]
@@ -172,6 +221,13 @@ class ImagePairs:
         fits = fitting(first, second, *pose, self._bound_rad)
         chance = chance_of_fit(first, second, *pose, self._bound_rad)
         return log10_nfa(len(first), int(np.count_nonzero(fits)), chance) <= MAX_LOG10_NFA
+
+    def _more_than_chance(self, geometry: Any, first: FloatArray, second: FloatArray) -> bool:
+        """Whether more of these bearings (M, 3) fit than wrong matches alone would: a pose that clouds have is none."""
+        if self.same_place(geometry):
+            return self._support(geometry, first, second) > 0
+        expected = len(first) * chance_of_fit(first, second, *relative(geometry), self._bound_rad)
+        return self._support(geometry, first, second) > expected + 3.0 * np.sqrt(expected)
 
     def _guided(self, first: int, second: int, geometry: Any) -> Any:
         """The geometry with the matches that are found near the epipolar planes, if they are more."""

@@ -45,7 +45,7 @@ from spherloc.mapping.upright import Tell
 from spherloc.registry import require
 from spherloc.types import BoolArray, FloatArray
 
-DATABASE_VERSION = 5
+DATABASE_VERSION = 6
 """Number to be increased when pairs are matched or checked in another way, so that old databases are not used."""
 DATABASES = "matches_*.db*"
 """Pattern of the names of databases, with the files that SQLite puts beside them."""
@@ -484,6 +484,8 @@ def _models(pycolmap: Any, database: Path, folder: Path, count: int, tell: Tell)
     mapper = options.mapper
     mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
     mapper.abs_pose_min_num_inliers, mapper.abs_pose_min_inlier_ratio = MIN_MATCHES, 0.05
+    # COLMAP starts with no pair that moved along the optical axis, where a narrow lens sees no depth; a wide one does.
+    mapper.init_max_forward_motion = 1.0
     options.triangulation.ignore_two_view_tracks = False
     models: list[Any] = []
     for first_pair in _TRIES:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -90,6 +91,18 @@ def test_a_map_has_the_poses_of_the_photographs(walk):
         and made.level.source == "vertical lines of 5 images"
     )
     assert not made.made.contradictions and not made.level.leaning
+
+
+def test_panoramas_straight_ahead_of_each_other_are_mapped(walk, tmp_path):
+    """All three on one line along the optical axis, with which COLMAP by itself starts no map."""
+    poses, found, *_ = walk
+    views = [view for view in found.views if view.name[:-4] in IMAGES[2:]]
+    for one, other in pairwise(views):
+        turn = poses[other.name][:, :3] @ poses[one.name][:, :3].T
+        way = poses[other.name][:, 3] - turn @ poses[one.name][:, 3]
+        assert abs(way[2]) > 0.99 * np.linalg.norm(way)
+    made = make_map(views, views[0].path.parent, tmp_path / "map", ScaleMeasurement(), None, lambda *_: None)
+    assert len(made.written.poses) == 3
 
 
 def test_its_scenes_open(walk):

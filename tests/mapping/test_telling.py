@@ -1,0 +1,90 @@
+"""Two panoramas under clouds: which matches are far away, and a pose that neither distance nor wind hides."""
+
+import numpy as np
+import pycolmap
+import pytest
+
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.frontend.features import Features
+from spherloc.frontend.matching import MatchOptions
+from spherloc.frontend.view import Gravity
+from spherloc.geometry import DOWN, pose, rotation_angle, so3_exp, transform, yaw_rotation
+from spherloc.mapping.pairs import ImagePairs, relative
+from spherloc.mapping.telling import below_sky, far_matches, unmoved
+
+CAMERA = Equirectangular(2048, 1024)
+BOUND = np.radians(0.5)
+LEVEL = (DOWN, DOWN)
+
+
+def unit(rows):
+    return rows / np.linalg.norm(rows, axis=-1, keepdims=True)
+
+
+def around(rng, count, lowest_deg, highest_deg):
+    """Bearings (count, 3) in all directions, between two elevations."""
+    yaw, up = rng.uniform(-np.pi, np.pi, count), np.radians(rng.uniform(lowest_deg, highest_deg, count))
+    return np.column_stack([np.cos(up) * np.sin(yaw), -np.sin(up), np.cos(up) * np.cos(yaw)])
+
+
+def street(rng, near, sky, wind_deg=0.0, wrong=40):
+    """Bearings in two level panoramas two metres apart of ``near`` things, of ``sky``, which drifts across the way, and
+    of ``wrong`` matches below the horizon; and the second camera's pose in the first's frame."""
+    second = pose(yaw_rotation(0.7), yaw_rotation(0.7) @ [0.0, 0.0, -2.0])
+    things = around(rng, near, -40.0, 10.0) * rng.uniform(3.0, 15.0, (near, 1))
+    clouds = around(rng, sky, 20.0, 60.0)
+    drift = clouds + np.radians(wind_deg) * np.array([1.0, 0.0, 0.0])
+    here = unit(np.concatenate([things, clouds, around(rng, wrong, -40.0, 10.0)]))
+    there = [transform(second, things), drift @ second[:, :3].T, around(rng, wrong, -40.0, 10.0)]
+    return here, unit(np.concatenate(there)), second
+
+
+def two_images(rng, here, there):
+    """``ImagePairs`` of two images whose feature number i is at the bearing number i of each."""
+    words = rng.normal(size=(len(here), 128)).astype(np.float32)
+    ones = np.ones(len(here))
+
+    def image(rays):
+        pixels, _ = CAMERA.project(rays)
+        return Features(pixels, 3.0 * ones, 0.0 * ones, ones, words.copy(), "sift", (2048, 1024))
+
+    every = np.arange(len(here))
+    gravity = [Gravity(DOWN, np.radians(0.5))] * 2
+    features = [image(here), image(there)]
+    return ImagePairs(pycolmap, [CAMERA] * 2, features, [every] * 2, gravity, MatchOptions())
+
+
+def test_far_matches_turn_alike(rng):
+    here, there, second = street(rng, 150, 100)
+    far = far_matches(here, there, BOUND)
+    assert far[150:250].all() and far[:150].mean() < 0.1 and far[250:].mean() < 0.05
+    assert (far == unmoved(here, there, second[:, :3], BOUND)).mean() > 0.98
+    assert not far_matches(here[:1], there[:1], BOUND).any() and len(far_matches(here[:0], there[:0], BOUND)) == 0
+    assert not far_matches(np.repeat(here[:1], 9, axis=0), np.repeat(there[:1], 9, axis=0), BOUND).any()
+
+
+def test_what_is_high_in_either_image_may_be_sky(rng):
+    here = around(rng, 50, -80.0, 14.0)
+    high = around(rng, 50, 16.0, 80.0)
+    assert below_sky(here, here, LEVEL).all()
+    assert not below_sky(high, here, LEVEL).any() and not below_sky(here, high, LEVEL).any()
+    tilt = so3_exp([0.0, 0.0, 0.6])
+    assert below_sky(here @ tilt.T, here, (tilt @ DOWN, DOWN)).all()
+
+
+@pytest.mark.parametrize("wind_deg", [0.0, 4.0])
+def test_clouds_do_not_hide_the_way(rng, wind_deg):
+    """Four times as many matches are of clouds, and fit any direction, or that of the wind."""
+    here, there, second = street(rng, 60, 240, wind_deg)
+    _, geometry = two_images(rng, here, there).compare(0, 1)
+    assert geometry is not None
+    turn, way = relative(geometry)
+    assert rotation_angle(turn @ second[:, :3].T) < np.radians(0.7)
+    assert way @ unit(second[:, 3]) > np.cos(np.radians(4.0))
+
+
+def test_a_pose_of_drifting_clouds_is_none(rng):
+    """Nothing below them matches, so that nothing shows where the camera went."""
+    here, there, _ = street(rng, 0, 240, wind_deg=4.0, wrong=60)
+    _, geometry = two_images(rng, here, there).compare(0, 1)
+    assert geometry is None
