@@ -111,6 +111,8 @@ def _judge(trace: Trace) -> Judgement:
 def _chance_margin(count: int, size: int, rate: float, fixed_by: int) -> tuple[float, str]:
     expected = max(expected_by_chance(count, size, rate, fixed_by), 1e-300)
     margin = np.log10(MAX_NFA) - np.log10(min(expected, 1e300))
+    if size <= fixed_by:
+        return margin, f"Only {size} different matches agree with it; any {fixed_by} fix a pose, wrong ones too."
     many = f"{expected_text(expected)}{' of' if expected >= 1e6 else ''} such sets"
     return margin, f"Only {size} different matches agree with it; {many} are expected by chance."
 

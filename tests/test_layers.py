@@ -378,7 +378,7 @@ def test_yaw_chart_shows_overlap_truth_and_estimate(mc: Trace) -> None:
     stage = mc.stage(YawStage)
     assert stage is not None and mc.problem.truth_cam_from_map is not None
     curves = {curve.label: curve for curve in at(mc, "yaw-clique").charts[0].curves}
-    np.testing.assert_array_equal(curves["arcs that overlap"].y, stage.overlap)
+    np.testing.assert_array_equal(curves["that overlap"].y, stage.overlap)
     assert curves["estimate"].x[0] == pytest.approx(np.degrees(stage.yaw_rad))
     assert curves["truth"].x[0] == pytest.approx(np.degrees(yaw_of(mc.problem.truth_cam_from_map[:, :3])))
     assert "estimate" not in {curve.label for curve in at(mc, "yaw-arcs").charts[0].curves}

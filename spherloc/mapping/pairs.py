@@ -6,7 +6,8 @@ explain its matches (a contrario, Moisan and Stival 2004): of many wrong matches
 Ambiguous matches that fit the pose are added afterwards.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from math import pi, tau
 from typing import Any
 
@@ -18,7 +19,7 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.consensus.spread import joined, spread_of
 from spherloc.frontend.feature_kinds import Descriptors
 from spherloc.frontend.features import Features
-from spherloc.frontend.matching import MatchOptions, match
+from spherloc.frontend.matching import FeatureMatches, MatchOptions, match
 from spherloc.frontend.view import Gravity
 from spherloc.geometry import DOWN, rotation_angle
 from spherloc.mapping.guided import guided_matches
@@ -45,6 +46,8 @@ MANY_FIT, MIN_RATIO = 55, 1.0 / 3.0
 """Two panoramas with fewer matches that fit than the first number, and a ``Spread.ratio`` below the second, may show
 one thing that stands at two places: so it is with all pairs whose pose is wrong in a rendered flat of rooms alike, and
 with few of the others."""
+MANY_FIT_LEARNED = 250
+"""The first of them where LightGlue matches, too, which finds many more on things that look alike."""
 FAR = 1.0 / 3.0
 """Share of the matches that fit a rotation alone, from which on they may hide where the camera went."""
 CLEARLY = 2.0
@@ -65,9 +68,11 @@ class ImagePairs:
         usable: Sequence[NDArray[np.int64]],
         gravity: Sequence[Gravity | None],
         matching: MatchOptions,
+        promising: Collection[Pair],
     ) -> None:
-        """``usable`` are the indices (K,) of each image's features for COLMAP, ``gravity`` that from vertical lines."""
-        self._matching = matching
+        """``usable`` are the indices (K,) of each image's features for COLMAP, ``gravity`` that from vertical lines. Of
+        joined kinds of features all are matched in ``promising`` pairs, the first in others."""
+        self._matching, self._promising = matching, promising
         self._cameras = cameras
         self._pycolmap = pycolmap
         self._features = features
@@ -95,7 +100,7 @@ class ImagePairs:
 
     def compare(self, first: int, second: int) -> tuple[NDArray[np.uint32], Any]:
         """Matches (M, 2), indices of usable features, and a ``TwoViewGeometry`` of those that fit, or None."""
-        found = match(self._features[first], self._features[second], self._matching)
+        found = self._matches(first, second)
         pairs = np.column_stack(
             [self._number_of[first][found.query_index], self._number_of[second][found.reference_index]]
         )
@@ -103,6 +108,17 @@ class ImagePairs:
         pairs = pairs[kept][np.argsort(found.ratios[kept], kind="stable")].astype(np.uint32)
         geometry = self._geometry(first, second, pairs)
         return pairs, None if geometry is None else self._guided(first, second, geometry)
+
+    def _matches(self, first: int, second: int) -> FeatureMatches:
+        one, other = self._features[first], self._features[second]
+        if self._learned(first, second) or not one.parts:
+            return match(one, other, self._matching)
+        return match(one.parts[0], other.parts[0], replace(self._matching, method="nearest", weights=None))
+
+    def _learned(self, first: int, second: int) -> bool:
+        """Whether LightGlue matches this pair."""
+        joined_kinds = bool(self._features[first].parts)
+        return self._matching.method == "lightglue" and (not joined_kinds or (first, second) in self._promising)
 
     def between(self, pair: Pair, pairs: NDArray[np.uint32], known: Mapping[Pair, Relative], middles: list[int]) -> Any:
         """A ``TwoViewGeometry`` of matches (M, 2), with a pose found through the images ``middles``; None if there is
@@ -133,7 +149,8 @@ class ImagePairs:
         """Whether what fits of the matches (M, 2) may be a thing that stands at two places."""
         rays = self._bearings[first][pairs[:, 0]], self._bearings[second][pairs[:, 1]]
         fits = fitting(*rays, *relative(geometry), self._bound_rad)
-        return fit_on_one_thing((self._cameras[first], self._cameras[second]), rays, fits)
+        many = MANY_FIT_LEARNED if self._learned(first, second) else MANY_FIT
+        return fit_on_one_thing((self._cameras[first], self._cameras[second]), rays, fits, many)
 
     def _geometry(self, first: int, second: int, pairs: NDArray[np.uint32]) -> Any:
         if len(pairs) < MIN_MATCHES:
@@ -227,7 +244,7 @@ class ImagePairs:
         if self.same_place(geometry):
             return self._support(geometry, first, second) > 0
         expected = len(first) * chance_of_fit(first, second, *relative(geometry), self._bound_rad)
-        return self._support(geometry, first, second) > expected + 3.0 * np.sqrt(expected)
+        return self._support(geometry, first, second) > expected + 3.0 * np.sqrt(max(expected, 1.0))
 
     def _guided(self, first: int, second: int, geometry: Any) -> Any:
         """The geometry with the matches that are found near the epipolar planes, if they are more."""
@@ -247,12 +264,14 @@ class ImagePairs:
         return geometry.config != self._pycolmap.TwoViewGeometryConfiguration.CALIBRATED
 
 
-def fit_on_one_thing(cameras: tuple[Camera, Camera], rays: tuple[FloatArray, FloatArray], fits: BoolArray) -> bool:
-    """Whether two panoramas show one thing that may stand at two places: few of their matches, with bearings (M, 3) in
-    each, fit a pose, and hardly any outside a part of the view. False for other cameras."""
+def fit_on_one_thing(
+    cameras: tuple[Camera, Camera], rays: tuple[FloatArray, FloatArray], fits: BoolArray, many: int = MANY_FIT
+) -> bool:
+    """Whether two panoramas show one thing that may stand at two places: fewer than ``many`` of their matches, with
+    bearings (M, 3) in each, fit a pose, and hardly any outside a part of the view. False for other cameras."""
     spreads = [spread_of(camera, seen, fits) for camera, seen in zip(cameras, rays, strict=True)]
     known = [spread for spread in spreads if spread is not None]
-    few = np.count_nonzero(fits) < MANY_FIT
+    few = np.count_nonzero(fits) < many
     return bool(few and len(known) == len(spreads) and joined(known).ratio < MIN_RATIO)
 
 

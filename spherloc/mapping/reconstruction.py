@@ -53,6 +53,8 @@ MAX_EXHAUSTIVE = 50
 """Largest number of images of which all pairs are tried; of more, each is tried with its neighbours by name and with
 similar images."""
 NEIGHBOURS, ALIKE = 5, 15
+NEIGHBOURS_LEARNED, ALIKE_LEARNED = 2, 6
+"""The same for LightGlue besides SIFT, which takes a second or two a pair."""
 WIDEST_RAD = np.radians(85.0)
 """Features farther from the optical axis are left out: COLMAP's fisheyes end at 90 degrees."""
 STRONG = 0.3
@@ -155,8 +157,11 @@ def reconstruct(
         try:
             ids = _described(pycolmap, database, views, features, usable)
             cameras = [view.camera for view in views]
-            compared = ImagePairs(pycolmap, cameras, features, usable, gravity, how.matching)
-            counts, same_place = _matched(database, ids, compared, _pairs(features), tell)
+            promising = _pairs(features, NEIGHBOURS_LEARNED, ALIKE_LEARNED) if len(how.features.parts) > 1 else ()
+            compared = ImagePairs(pycolmap, cameras, features, usable, gravity, how.matching, frozenset(promising))
+            every = len(views) <= MAX_EXHAUSTIVE
+            pairs = list(combinations(range(len(views)), 2)) if every else _pairs(features, NEIGHBOURS, ALIKE)
+            counts, same_place = _matched(database, ids, compared, pairs, tell)
         finally:
             database.close()
     except RuntimeError as error:
@@ -459,17 +464,15 @@ def _of(ids: Sequence[int], pair: tuple[int, int]) -> tuple[int, int]:
     return ids[pair[0]], ids[pair[1]]
 
 
-def _pairs(features: Sequence[Features]) -> list[tuple[int, int]]:
-    """The pairs of images that are to be matched."""
-    count = len(features)
-    if count <= MAX_EXHAUSTIVE:
-        return list(combinations(range(count), 2))
-    pairs = {(first, second) for first, second in combinations(range(count), 2) if second - first <= NEIGHBOURS}
+def _pairs(features: Sequence[Features], neighbours: int, alike: int) -> list[Pair]:
+    """The pairs of each image with ``neighbours`` by name on either side, and with the ``alike`` images that look most
+    like it."""
+    pairs = {(one, other) for one, other in combinations(range(len(features)), 2) if other - one <= neighbours}
     described = [retrieval.real_descriptors(one) for one in features]
     words = retrieval.vocabulary([one for one in described if len(one)])
     vectors = np.stack([retrieval.vlad(one, words) for one in described])
     for index, vector in enumerate(vectors):
-        for other in retrieval.rank(vector, vectors)[: ALIKE + 1].tolist():
+        for other in retrieval.rank(vector, vectors)[: alike + 1].tolist():
             if other != index:
                 pairs.add((min(index, other), max(index, other)))
     return sorted(pairs)

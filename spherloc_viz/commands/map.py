@@ -21,6 +21,7 @@ from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError, SpherlocError, StoppedError, reason, show
 from spherloc.files import is_image, names_in
+from spherloc.frontend import trained
 from spherloc.frontend.features import FeatureOptions
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.matching import MatchOptions
@@ -53,14 +54,14 @@ def make(
     masks: Masks | None,
     find_carried: bool,
     positions: Path | None,
-    features: str,
+    features: str | None,
 ) -> int:
     """Make the map, and print the result and what to do next; returns 1 if not all images are in it.
 
     ``cameras`` are those of the calibration file by name, ``video`` a file and a number of frames to take from it into
     ``folder``; with ``panorama``, images of 2 to 1 are panoramas in any case. With ``find_carried``, what moves with
     the camera below panoramas is left out, too. ``positions`` is a file of where the images were taken, and
-    ``features`` one of ``MAP_FEATURES``. Raises ``InputError``.
+    ``features`` one of ``MAP_FEATURES``, the best installed if None. Raises ``InputError``.
     """
     end_without_a_trace()
     how = how_of(features)
@@ -135,8 +136,11 @@ def cameras_of_file(file: Path | None, name: str | None) -> dict[str, Camera]:
     return {one: load_camera(file, one) for one in names}
 
 
-def how_of(features: str) -> FrontendOptions:
-    """Features with their usual matching; raises ``InputError`` if they are unknown or not installed."""
+def how_of(features: str | None = None) -> FrontendOptions:
+    """Features with their usual matching, the best installed ones if None; raises ``InputError`` if they are unknown or
+    not installed."""
+    if features is None:
+        features = "sift+aliked" if trained.installed() else "sift"
     if features not in MAP_FEATURES:
         raise InputError(f"--features is {show(features)}; give {', '.join(MAP_FEATURES)}.")
     if features == "sift":
@@ -190,7 +194,7 @@ def main(folder: Path, output: Path) -> int:
     with for_a_page():
         try:
             found = photographs(folder, {})
-            made = make_map(found.views, folder, output, ScaleMeasurement(), None, _progress)
+            made = make_map(found.views, folder, output, ScaleMeasurement(), None, _progress, how=how_of())
             report.write_text(map_report(made, found), encoding="utf-8")
         except SpherlocError as error:
             _tell({"error": str(error)})

@@ -26,8 +26,7 @@ MAP_FEATURES = {
     "aliked": "ALIKED, matched by LightGlue",
     "sift+aliked": "SIFT, and ALIKED matched by LightGlue",
 }
-"""Kinds of features and what they are called. "sift" is what is taken by itself, though ALIKED be installed: LightGlue
-takes seconds a pair (``python -m benchmarks.features``)."""
+"""Kinds of features and what they are called."""
 
 
 def summary(made: Map, found: Photographs) -> list[str]:

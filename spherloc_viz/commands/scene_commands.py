@@ -318,7 +318,7 @@ def map(
     mask: OptionalPath = None,
     nadir: OptionalFloat = None,
     seam: OptionalFloat = None,
-    features: Annotated[str, arg(metavar="sift|aliked|sift+aliked")] = "sift",
+    features: Annotated[str | None, arg(metavar="sift|aliked|sift+aliked")] = None,
     localize: OptionalPath = None,
 ) -> int:
     """Make a map of your own photographs: panoramas, or images of calibrated wide cameras.
@@ -351,7 +351,8 @@ def map(
         nadir: Leave out what is within so many degrees of straight down, such as the tripod; without it, what all
             panoramas show in the same direction down there is left out.
         seam: Leave out so many degrees on both sides of the seam between the two lenses of a 360-degree camera.
-        features: What is matched: sift, aliked with LightGlue (the extra learned), or both.
+        features: What is matched: sift, aliked with LightGlue (the extra learned), or both; without it, both if that
+            extra is installed.
         localize: Folder of other images of that camera; a scene is written that localizes them in the map.
     """
     from spherloc.frontend.masks import Masks

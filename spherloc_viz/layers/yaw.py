@@ -464,7 +464,7 @@ def _ring(
 def counts_chart(view: RunView, counts: np.ndarray, yaw_rad: float | None = None) -> Chart:
     """Overlap count over yaw, with the truth and an estimate if there is one."""
     peak = float(counts.max(initial=1))
-    curves = [ring.step_curve("arcs that overlap", counts), *ring.markers(view, peak, yaw_rad)]
+    curves = [ring.step_curve("that overlap", counts), *ring.markers(view, peak, yaw_rad)]
     return Chart("yaw", "Arcs that overlap at each yaw", "yaw (°)", "arcs", tuple(curves))
 
 

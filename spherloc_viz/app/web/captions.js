@@ -66,7 +66,6 @@
     const end = document.querySelector(".step-words")?.dataset.end;
     for (const one of document.querySelectorAll("button")) {
       const name = one.textContent.trim();
-      if (one.closest(".introduction")) continue; // its Next is another one
       const last = { "Previous": "first", "‹ Previous": "first", "Next": "last", "Next ›": "last" }[name];
       if (last && one.disabled !== (end === last)) one.disabled = end === last;
     }

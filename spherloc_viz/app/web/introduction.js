@@ -1,5 +1,5 @@
 // Shows the introduction that Python put on the page (data-introduction) on the first visit: a card over the canvas with
-// a few moments, each of which takes the page to a step. Only the reader turns it: Next, Back and Skip, the arrow keys, B, N
+// a few moments, each of which takes the page to a step. Only the reader turns it: Continue, Back and Skip, the arrow keys, B, N
 // and Escape. It is not shown again: the browser remembers it. Nor is it shown to whoever comes by a link. An element of the
 // class "introduce" shows it again.
 (() => {
@@ -46,7 +46,7 @@
       element("span", "count", ""),
       button("skip", "Skip", end),
       button("back", "Back", () => turn(-1)),
-      button("main", "Next", () => (index === told.moments.length - 1 ? end() : turn(1))),
+      button("main", "Continue", () => (index === told.moments.length - 1 ? end() : turn(1))),
     );
     card.append(element("div", "title", ""), element("div", "told", ""), row);
     document.body.append(card);
@@ -63,7 +63,7 @@
     part("count").textContent = `${index + 1} of ${told.moments.length}`;
     part("skip").hidden = last;
     part("back").hidden = index === 0;
-    part("main").textContent = last ? "Begin" : "Next";
+    part("main").textContent = last ? "Close" : "Continue";
     if (document.activeElement === document.body || document.activeElement.hidden) part("main").focus();
     go(step);
   }

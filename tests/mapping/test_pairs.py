@@ -1,11 +1,12 @@
-"""Two panoramas under clouds: which matches are far away, and a pose that neither distance nor wind hides."""
+"""Pairs of panoramas: a pose that neither clouds nor wind hide, and which pairs LightGlue matches."""
 
 import numpy as np
 import pycolmap
 import pytest
 
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.frontend.features import Features
+from spherloc.errors import InputError
+from spherloc.frontend.features import Features, _joined
 from spherloc.frontend.matching import MatchOptions
 from spherloc.frontend.view import Gravity
 from spherloc.geometry import DOWN, pose, rotation_angle, so3_exp, transform, yaw_rotation
@@ -39,19 +40,23 @@ def street(rng, near, sky, wind_deg=0.0, wrong=40):
     return here, unit(np.concatenate(there)), second
 
 
-def two_images(rng, here, there):
-    """``ImagePairs`` of two images whose feature number i is at the bearing number i of each."""
+def two_images(rng, here, there, parts=1, matching=None, promising=()):
+    """``ImagePairs`` of two images whose feature number i is at the bearing number i of each, in as many kinds."""
     words = rng.normal(size=(len(here), 128)).astype(np.float32)
     ones = np.ones(len(here))
 
     def image(rays):
         pixels, _ = CAMERA.project(rays)
-        return Features(pixels, 3.0 * ones, 0.0 * ones, ones, words.copy(), "sift", (2048, 1024))
+        kinds = [
+            Features(pixels.copy(), 3.0 * ones, 0.0 * ones, ones.copy(), words.copy(), kind, (2048, 1024))
+            for kind in ("sift", "aliked")[:parts]
+        ]
+        return _joined(kinds, "sift+aliked") if parts > 1 else kinds[0]
 
-    every = np.arange(len(here))
+    every = np.arange(parts * len(here))
     gravity = [Gravity(DOWN, np.radians(0.5))] * 2
     features = [image(here), image(there)]
-    return ImagePairs(pycolmap, [CAMERA] * 2, features, [every] * 2, gravity, MatchOptions())
+    return ImagePairs(pycolmap, [CAMERA] * 2, features, [every] * 2, gravity, matching or MatchOptions(), promising)
 
 
 def test_far_matches_turn_alike(rng):
@@ -88,3 +93,13 @@ def test_a_pose_of_drifting_clouds_is_none(rng):
     here, there, _ = street(rng, 0, 240, wind_deg=4.0, wrong=60)
     _, geometry = two_images(rng, here, there).compare(0, 1)
     assert geometry is None
+
+
+def test_lightglue_matches_promising_pairs_only(rng, tmp_path):
+    """Of others, the features of the first kind are matched by nearest neighbours."""
+    here, there, second = street(rng, 100, 0)
+    lightglue = MatchOptions("lightglue", weights=tmp_path / "none.onnx")
+    pairs, geometry = two_images(rng, here, there, 2, lightglue).compare(0, 1)
+    assert pairs.max() < len(here) and rotation_angle(relative(geometry)[0] @ second[:, :3].T) < np.radians(0.7)
+    with pytest.raises(InputError, match=r"none\.onnx"):
+        two_images(rng, here, there, 2, lightglue, {(0, 1)}).compare(0, 1)
