@@ -25,7 +25,7 @@ from spherloc.geometry import DOWN, rotation_angle
 from spherloc.mapping.guided import guided_matches
 from spherloc.mapping.level_pairs import chance_of_fit, fitting, level_pair, log10_nfa
 from spherloc.mapping.rotations import OFF_RAD
-from spherloc.mapping.telling import below_sky, far_matches, unmoved
+from spherloc.mapping.telling import below_sky, far_rotation, unmoved
 from spherloc.mapping.triangles import MIN_FIT, Pair, Relative, elsewhere, through
 from spherloc.types import BoolArray, FloatArray
 
@@ -50,6 +50,8 @@ MANY_FIT_LEARNED = 250
 """The first of them where LightGlue matches, too, which finds many more on things that look alike."""
 FAR = 1.0 / 3.0
 """Share of the matches that fit a rotation alone, from which on they may hide where the camera went."""
+NOT_FAR = 3.0
+"""A match is of no far thing from so many times the bound on: what is just beyond it has noise and no parallax."""
 CLEARLY = 2.0
 """A pose is better than another if this many times as many of the matches that tell it fit; clouds may have made a pose
 if this many times as many of the matches above the horizon fit it as of the others."""
@@ -167,17 +169,22 @@ class ImagePairs:
         other = max(self._poses(first, second, pairs[telling]), key=lambda one: self._support(one, *seen), default=None)
         if other is not None and self._support(other, *seen) >= CLEARLY * fits and self._no_chance(other, *seen):
             return other
-        return geometry if geometry is not None and self._more_than_chance(geometry, *seen) else None
+        if geometry is None or self.same_place(geometry) or self._more_than_chance(geometry, *seen):
+            return geometry
+        return None
 
     def _telling(self, first: int, second: int, rays: tuple[FloatArray, FloatArray], geometry: Any) -> BoolArray | None:
         """Mask (M,) of the bearings (M, 3) that show where the camera went, if clouds or other far things may hide it;
         None if they do not, or if all matches are theirs."""
-        far = far_matches(*rays, self._bound_rad)
+        turn = far_rotation(*rays, self._bound_rad)
+        if turn is None:
+            return None
+        far = unmoved(*rays, turn, self._bound_rad)
         known = all(
             self._gravity[one] is not None or isinstance(self._cameras[one], Equirectangular) for one in (first, second)
         )
         low = below_sky(*rays, (self._down(first), self._down(second))) if known else np.ones(len(far), np.bool_)
-        telling = low & ~far
+        telling = low & ~unmoved(*rays, turn, NOT_FAR * self._bound_rad)
         if np.count_nonzero(telling) < MIN_MATCHES:
             return None
         hidden = bool(far.mean() >= FAR)
@@ -241,8 +248,6 @@ class ImagePairs:
 
     def _more_than_chance(self, geometry: Any, first: FloatArray, second: FloatArray) -> bool:
         """Whether more of these bearings (M, 3) fit than wrong matches alone would: a pose that clouds have is none."""
-        if self.same_place(geometry):
-            return self._support(geometry, first, second) > 0
         expected = len(first) * chance_of_fit(first, second, *relative(geometry), self._bound_rad)
         return self._support(geometry, first, second) > expected + 3.0 * np.sqrt(max(expected, 1.0))
 

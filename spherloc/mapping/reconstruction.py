@@ -53,7 +53,7 @@ MAX_EXHAUSTIVE = 50
 """Largest number of images of which all pairs are tried; of more, each is tried with its neighbours by name and with
 similar images."""
 NEIGHBOURS, ALIKE = 5, 15
-NEIGHBOURS_LEARNED, ALIKE_LEARNED = 2, 6
+NEIGHBOURS_LEARNED, ALIKE_LEARNED = 2, 4
 """The same for LightGlue besides SIFT, which takes a second or two a pair."""
 WIDEST_RAD = np.radians(85.0)
 """Features farther from the optical axis are left out: COLMAP's fisheyes end at 90 degrees."""

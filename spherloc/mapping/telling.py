@@ -17,27 +17,32 @@ SKY = float(np.sin(np.radians(15.0)))
 """Sine of the elevation above which there may be nothing but sky; hills and houses reach it where they are near."""
 
 
-def far_matches(first: FloatArray, second: FloatArray, bound_rad: float) -> BoolArray:
-    """(M,) matches whose bearings (M, 3) fit one rotation to ``bound_rad``: the rotation that most of them fit."""
+def far_rotation(first: FloatArray, second: FloatArray, bound_rad: float) -> FloatArray | None:
+    """The rotation (3, 3) that most matches with bearings (M, 3) fit alone to ``bound_rad``: that of far things.
+
+    None if no two bearings are apart and fit one.
+    """
     count = len(first)
     if count < 2:
-        return np.zeros(count, np.bool_)
+        return None
     one, other = np.random.default_rng([count, 2]).integers(0, count, (2, SAMPLES))
     here, there = _frames(first[one], first[other]), _frames(second[one], second[other])
-    tried = (
-        (here[1] >= APART) & (there[1] >= APART) & (np.abs(np.arcsin(here[1]) - np.arcsin(there[1])) <= 2 * bound_rad)
-    )
+    turn = np.abs(np.arcsin(here[1]) - np.arcsin(there[1]))
+    tried = (here[1] >= APART) & (there[1] >= APART) & (turn <= 2.0 * bound_rad)
     rotations = there[0][tried] @ np.swapaxes(here[0][tried], 1, 2)
     if len(rotations) == 0:
-        return np.zeros(count, np.bool_)
+        return None
     fits = ((first @ np.swapaxes(rotations, 1, 2)) * second).sum(axis=2) >= np.cos(bound_rad)
-    best: BoolArray = fits[np.argmax(np.count_nonzero(fits, axis=1))]
+    counts = np.count_nonzero(fits, axis=1)
+    best, rotation = counts.max(), rotations[counts.argmax()]
     for _ in range(ROUNDS):
-        better = unmoved(first, second, _rotation(first[best], second[best]), bound_rad)
-        if np.count_nonzero(better) <= np.count_nonzero(best):
+        near = unmoved(first, second, rotation, bound_rad)
+        better = _rotation(first[near], second[near])
+        more = np.count_nonzero(unmoved(first, second, better, bound_rad))
+        if more <= best:
             break
-        best = better
-    return best
+        best, rotation = more, better
+    return rotation
 
 
 def unmoved(first: FloatArray, second: FloatArray, rotation: FloatArray, bound_rad: float) -> BoolArray:

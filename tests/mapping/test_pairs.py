@@ -11,7 +11,7 @@ from spherloc.frontend.matching import MatchOptions
 from spherloc.frontend.view import Gravity
 from spherloc.geometry import DOWN, pose, rotation_angle, so3_exp, transform, yaw_rotation
 from spherloc.mapping.pairs import ImagePairs, relative
-from spherloc.mapping.telling import below_sky, far_matches, unmoved
+from spherloc.mapping.telling import below_sky, far_rotation, unmoved
 
 CAMERA = Equirectangular(2048, 1024)
 BOUND = np.radians(0.5)
@@ -61,11 +61,22 @@ def two_images(rng, here, there, parts=1, matching=None, promising=()):
 
 def test_far_matches_turn_alike(rng):
     here, there, second = street(rng, 150, 100)
-    far = far_matches(here, there, BOUND)
+    turn = far_rotation(here, there, BOUND)
+    assert turn is not None and rotation_angle(turn @ second[:, :3].T) < 1e-3
+    far = unmoved(here, there, turn, BOUND)
     assert far[150:250].all() and far[:150].mean() < 0.1 and far[250:].mean() < 0.05
-    assert (far == unmoved(here, there, second[:, :3], BOUND)).mean() > 0.98
-    assert not far_matches(here[:1], there[:1], BOUND).any() and len(far_matches(here[:0], there[:0], BOUND)) == 0
-    assert not far_matches(np.repeat(here[:1], 9, axis=0), np.repeat(there[:1], 9, axis=0), BOUND).any()
+    assert far_rotation(here[:1], there[:1], BOUND) is None and far_rotation(here[:0], there[:0], BOUND) is None
+    assert far_rotation(np.repeat(here[:1], 9, axis=0), np.repeat(there[:1], 9, axis=0), BOUND) is None
+
+
+def test_one_place_stays_one_place(rng):
+    """Wrong matches beside those that all turned alike make no way between two images taken from one place."""
+    rays, second = around(rng, 300, -60.0, 60.0), yaw_rotation(0.7)
+    there = unit(rays @ second.T + 0.003 * rng.normal(size=rays.shape))
+    wrong = around(rng, 60, -40.0, 10.0), around(rng, 60, -40.0, 10.0)
+    pair = two_images(rng, np.concatenate([rays, wrong[0]]), np.concatenate([there, wrong[1]]))
+    _, geometry = pair.compare(0, 1)
+    assert geometry is not None and pair.same_place(geometry)
 
 
 def test_what_is_high_in_either_image_may_be_sky(rng):
