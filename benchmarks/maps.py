@@ -1,6 +1,7 @@
 """Maps of rendered panoramas whose true positions are known: a Markdown table of right and wrong images.
 
     .venv/bin/python -m benchmarks.maps [apartment:12 campus:20 ...]     # some four minutes for the default ones
+    .venv/bin/python -m benchmarks.maps --features sift+aliked           # fifteen, with the extra ``learned``
 
 A world and a number of panoramas, evenly along its path, are one row. Each of the maps that ``spherloc map`` makes of
 them is put onto the truth by the similarity that most of its images agree with; an image that is then more than
@@ -22,6 +23,7 @@ from spherloc.geometry import camera_centre
 from spherloc.mapping.make import ScaleMeasurement, make_map
 from spherloc.mapping.photographs import photographs
 from spherloc.types import FloatArray
+from spherloc_viz.commands.map import how_of
 
 SETS = ("apartment:10", "apartment:12", "apartment:16", "apartment:22", "campus:12", "campus:20")
 WRONG_M = 0.25
@@ -75,14 +77,16 @@ def errors_m(poses: dict[str, FloatArray], places: dict[str, FloatArray]) -> Flo
     return best
 
 
-def row(world: str, count: int) -> str:
+def row(world: str, count: int, features: str) -> str:
     """One line of the table."""
     with TemporaryDirectory() as place:
         folder = Path(place) / "panoramas"
         places = photographed(world, count, folder)
         views = photographs(folder, {}).views
         try:
-            made = make_map(views, folder, Path(place) / "map", ScaleMeasurement(), None, lambda *_: None)
+            made = make_map(
+                views, folder, Path(place) / "map", ScaleMeasurement(), None, lambda *_: None, how=how_of(features)
+            )
         except InputError as error:
             return f"| {world}, {count} | none: {error} | | | |"
         maps = [one.written.poses for one in (made, *made.groups)]
@@ -99,10 +103,12 @@ def main() -> None:
     """Print the table."""
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     words.add_argument("sets", nargs="*", default=SETS, metavar="WORLD:COUNT")
+    words.add_argument("--features", default="sift")
+    given = words.parse_args()
     print("| panoramas | maps of | right | wrong | median of the right ones, cm |\n|---|---|---|---|---|")
-    for one in words.parse_args().sets:
+    for one in given.sets:
         world, _, count = one.partition(":")
-        print(row(world, int(count)), flush=True)
+        print(row(world, int(count), given.features), flush=True)
 
 
 if __name__ == "__main__":
