@@ -63,7 +63,7 @@ def _frames(one: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]
     across = np.cross(one, other)
     sine = np.linalg.norm(across, axis=1)
     across /= np.maximum(sine, 1e-9)[:, None]
-    return np.stack([one, np.cross(across, one), across], axis=2), np.minimum(sine, 1.0)
+    return np.stack([one, np.cross(across, one), across], axis=2, dtype=np.float64), np.minimum(sine, 1.0)
 
 
 def _rotation(first: FloatArray, second: FloatArray) -> FloatArray:

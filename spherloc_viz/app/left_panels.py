@@ -90,11 +90,11 @@ class LeftPanels:
         selected: tuple[int, ...],
         hidden: bool,
         offered: str = "",
-        cause: str = "",
+        cause: tuple[str, str] = ("", ""),
     ) -> None:
         """Show a step of a run, in the views that are to be seen. ``selected`` are numbers in the problem; ``hidden``
         says that what came out is not to be told: then run and picture are without it. ``offered`` is HTML that says
-        which answers are hidden, and ``cause`` what is wrong with the run, at its last step."""
+        which answers are hidden, and ``cause`` what is wrong with the run and, at its last step, a sentence on that."""
         kept: NDArray = run.kept
         tables = [table for table in picture.tables if table.name != outcome.name]
         self.steps.show(picture.step, playing, tables)
@@ -115,7 +115,7 @@ class LeftPanels:
             self._lens.draw(run, hidden)
         if "Matches" in seen:
             self.matches.draw(run.trace, selected, kept, hidden)
-        summary, ending = ("", "") if hidden else (summary_html(run.trace, cause), table_html(outcome, linked))
+        summary, ending = ("", "") if hidden else (summary_html(run.trace, *cause), table_html(outcome, linked))
         summary = offered + summary
         if self._opening == run.request.scene.scene:
             self._opening = self._card.content = ""

@@ -194,7 +194,9 @@ class RunDisplay:
             plain = replace(picture, step=drawn.step)
             outcome = self._outcome_of(trace, known_judgement(known.trace))
             offered = hidden_html(withheld, not presenter) if withheld else ""
-            cause = str(diagnosis.cause) if diagnosis is not None and diagnosis.doubtful else ""
+            cause = ("", "")
+            if diagnosis is not None and diagnosis.doubtful:
+                cause = str(diagnosis.cause), diagnosis.summary if last else ""
             self.panels.draw(run, plain, pause is not None, outcome, selected, not told, offered, cause)
             self.panels.diagnose("" if hidden else _diagnosed_html(trace, diagnosis, index))
             self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, not told)

@@ -160,8 +160,8 @@ def summary_of(trace: Trace) -> tuple[str, list[str]]:
     return verdict(trace, metrics.success), facts
 
 
-def summary_html(trace: Trace, cause: str = "") -> str:
-    """A run in one line; ``cause`` is what is wrong with it, if that is to be told."""
+def summary_html(trace: Trace, cause: str = "", why: str = "") -> str:
+    """A run in one line; ``cause`` is what is wrong with it, if that is to be told, and ``why`` a sentence on that."""
     words, facts = summary_of(trace)
     told = f"{words.capitalize()}: {cause}" if cause else words.capitalize()
     # In a narrow line the time stands alone; under a resting pointer it says what it is the time of.
@@ -172,7 +172,7 @@ def summary_html(trace: Trace, cause: str = "") -> str:
         for fact in facts
     )
     line = f'<b style="{_value_css(words)}">{escape(told)}</b> · ' + " · ".join(shown)
-    return box(line, "font-size:12.5px;padding-top:.2em")
+    return box(line + (f"<div>{escape(why)}</div>" if why else ""), "font-size:12.5px;padding-top:.2em")
 
 
 def _value_css(value: object) -> str:
