@@ -18,7 +18,7 @@ from spherloc.errors import ProblemError
 from spherloc.estimators import default_options, estimate
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN
-from spherloc.mapping.reconstruction import Reconstruction, contradictions, points_of
+from spherloc.mapping.model import Reconstruction, contradictions, points_of
 from spherloc.mapping.upright import Level, Tell, arbitrary_scale
 from spherloc.outcome import Outcome, judge
 from spherloc.problem import Problem

@@ -12,9 +12,10 @@ from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.carried import carried_nadir_deg
 from spherloc.mapping.later import place_rest
+from spherloc.mapping.model import Reconstruction
 from spherloc.mapping.photographs import NewImages
 from spherloc.mapping.positions import Positions, gps_of_images
-from spherloc.mapping.reconstruction import DATABASES, Reconstruction, reconstruct
+from spherloc.mapping.reconstruction import DATABASES, reconstruct
 from spherloc.mapping.scene_files import SCENE
 from spherloc.mapping.upright import (
     GravityByLines,

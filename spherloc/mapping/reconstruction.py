@@ -4,26 +4,21 @@ Panoramas stay panoramas: COLMAP's camera EQUIRECTANGULAR. Between two of them a
 not only a homography: a full sphere sees more than one plane, and matches that fit a single plane may be on a facade, a
 poster or a floor that looks the same elsewhere.
 
-Places that look alike (two hotel rooms, a row of houses) give wrong matches that fit a pose. A map that takes such
-places for one puts photographs next to each other that have hardly a match although nothing is between them: a
-contradiction. The map is then cut where fewest matches connect it. A second map is made from the strong pairs alone,
+Where places look alike, a map may take two for one (see ``model``). A second map is made from the strong pairs alone,
 and the map with more images, minus a penalty for contradictions, is taken.
 """
 
-import copy
 import ctypes
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,8 +30,8 @@ from spherloc.frontend import retrieval
 from spherloc.frontend.features import VERSION, Features, extract
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
-from spherloc.geometry import camera_centre
 from spherloc.mapping.advice import advice
+from spherloc.mapping.model import Reconstruction, parted, registered, untangled, worth
 from spherloc.mapping.pairs import MIN_MATCHES, ImagePairs, relative
 from spherloc.mapping.parallel import as_completed
 from spherloc.mapping.rotations import agreeing
@@ -59,68 +54,12 @@ WIDEST_RAD = np.radians(85.0)
 """Features farther from the optical axis are left out: COLMAP's fisheyes end at 90 degrees."""
 STRONG = 0.3
 """A strong pair has this share of the matches of the best pair of either image."""
-NEARBY = 2
-"""Number of nearest images in the map that should match an image."""
-MIN_SUPPORT = 0.15
-"""Least number of matches of two nearby images, as a share of those of either image's best pair; fewer contradict."""
-SIGHT_RAD, SIGHT_POINTS, SIGHT_FACTOR = np.radians(25.0), 8, 1.2
-"""An image sees past another camera if it has at least the second number of points within the first angle around the
-direction of that camera, and half of them are farther away than the camera by the third factor."""
-COST_OF_CONTRADICTION = 4.0
-"""Weight of the share of contradictions when two maps are compared by their share of images."""
 _TRIES = (
     {"init_min_num_inliers": 50, "init_min_tri_angle": 4.0},
     {"init_min_num_inliers": 25, "init_min_tri_angle": 2.0},
     {"init_min_num_inliers": 15, "init_min_tri_angle": 1.0},
 )
 """Conditions for the first pair of a model, tried one after another until there is a model."""
-
-
-@dataclass(frozen=True, eq=False)
-class Reconstruction:
-    """A model that COLMAP could make."""
-
-    model: Any
-    """``pycolmap.Reconstruction``."""
-    poses: dict[str, FloatArray]
-    """Poses (3, 4) from the model's frame, which has no scale and no up, by name of a registered image."""
-    matches: NDArray[np.int64]
-    """(V, V) number of matches of each pair of images after the two-view check."""
-    contradictions: tuple[tuple[str, str], ...]
-    """Names of pairs of images that the model puts next to each other and in sight of each other, but that hardly
-    match."""
-    all_matches: NDArray[np.int64]
-    """(V, V) like ``matches``, but with pairs of images that were taken from one place."""
-    database: Path
-    """COLMAP's database with features and matches of all images."""
-    ids: dict[str, int]
-    """Ids of all images in the database, by name."""
-
-    def without(self, names: Collection[str]) -> "Reconstruction":
-        """The model without the images ``names``, and without points that fewer than two of the other images see."""
-        for number in list(self.model.reg_image_ids()):
-            image = self.model.image(number)
-            if image.name in names:
-                self.model.deregister_frame(image.frame_id)
-        poses = {name: pose for name, pose in self.poses.items() if name not in names}
-        against = tuple(pair for pair in self.contradictions if not set(pair) & set(names))
-        return replace(self, poses=poses, contradictions=against)
-
-    def judged(self) -> "Reconstruction":
-        """The model with its contradictions computed anew."""
-        against = contradictions(self.poses, list(self.ids), self.all_matches, points_of(self.model))
-        return replace(self, contradictions=against)
-
-    def points(self) -> FloatArray:
-        """Positions (N, 3) of the points in the model's present frame."""
-        return np.array([point.xyz for point in self.model.points3D.values()]).reshape(-1, 3)
-
-    def depths(self) -> FloatArray:
-        """Distance (N,) of each point to an image that sees it, in units of the model's present frame."""
-        centres = {number: self.model.image(number).projection_center() for number in self.model.reg_image_ids()}
-        points = self.model.points3D.values()
-        seen_from = [centres[point.track.elements[0].image_id] for point in points]
-        return np.linalg.norm(self.points() - np.reshape(seen_from, (-1, 3)), axis=1)
 
 
 def reconstruct(
@@ -161,7 +100,7 @@ def reconstruct(
             compared = ImagePairs(pycolmap, cameras, features, usable, gravity, how.matching, frozenset(promising))
             every = len(views) <= MAX_EXHAUSTIVE
             pairs = list(combinations(range(len(views)), 2)) if every else _pairs(features, NEIGHBOURS, ALIKE)
-            counts, same_place = _matched(database, ids, compared, pairs, tell)
+            counts, same_place, one_thing = _matched(database, ids, compared, pairs, tell)
         finally:
             database.close()
     except RuntimeError as error:
@@ -177,10 +116,15 @@ def reconstruct(
                 "the calibration is wrong, or something moves along and is seen in each, such as a car or a tripod: "
                 f"{advice('moves along')}."
             )
+        found = f"the best pair has {counts.max(initial=0)} matches that fit together, but {MIN_MATCHES} are needed"
+        if one_thing:
+            most = max(one_thing.values())
+            found = (
+                f"up to {most} matches of a pair fit together, but in one part of the view, as of a thing at two places"
+            )
         raise InputError(
-            f"no two of the {len(views)} photographs show the same place from two positions: the best pair has "
-            f"{counts.max(initial=0)} matches that fit together, but {MIN_MATCHES} are needed. Take them closer "
-            "to each other, half a metre to two metres apart indoors."
+            f"no two of the {len(views)} photographs surely show the same place from two positions: {found}. Take them "
+            "closer to each other, half a metre to two metres apart indoors."
         )
     names = [view.name for view in views]
     made = [_models_of(pycolmap, path, names, ids, counts, same_place, keep, tell) for keep in (0.0, STRONG)]
@@ -190,7 +134,7 @@ def reconstruct(
             f"COLMAP could not start a map from these {len(views)} photographs, although pairs of them match: they "
             "may have been taken from one place. Take them half a metre to two metres apart."
         )
-    return max(candidates, key=lambda one: _worth(one[0]))
+    return max(candidates, key=lambda one: worth(one[0]))
 
 
 def _models_of(
@@ -220,119 +164,10 @@ def _models_of(
     number_of = dict(zip(names, ids, strict=True))
     found = []
     for model in models:
-        poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in _registered(model)}
+        poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in registered(model)}
         whole = Reconstruction(model, poses, counts, (), counts + same_place, path, number_of)
         found += parted(whole.judged())
     return untangled(found)
-
-
-def parted(made: Reconstruction) -> list[Reconstruction]:
-    """The model cut until no two images contradict each other: parts of two images or more, the largest first.
-
-    A contradiction says that two images do not belong next to each other, so somewhere between them the model takes two
-    similar places for one. The cut that separates the two images with the fewest matches is made there.
-    """
-    if not made.contradictions:
-        return [made]
-    place = {name: index for index, name in enumerate(made.ids)}
-    graph = nx.Graph()
-    graph.add_nodes_from(made.poses)
-    for one, other in combinations(made.poses, 2):
-        if matches := int(made.all_matches[place[one], place[other]]):
-            graph.add_edge(one, other, capacity=matches)
-    cuts = [nx.minimum_cut(graph, *pair) for pair in sorted(set(map(_sorted, made.contradictions)))]
-    _, (first, second) = min(cuts, key=lambda cut: cut[0])
-    parts = []
-    for side in (first, second):
-        if len(made.poses.keys() - side) > 1:
-            part = replace(made, model=copy.deepcopy(made.model)).without(side)
-            parts += parted(part.judged())
-    return sorted(parts, key=lambda part: -len(part.poses))
-
-
-def _sorted(pair: tuple[str, str]) -> tuple[str, str]:
-    return (min(pair), max(pair))
-
-
-def untangled(made: Sequence[Reconstruction]) -> tuple[Reconstruction, ...]:
-    """The models without images that have more matches with those of another one, the largest first.
-
-    Models that share images and yet could not be joined take two places for one somewhere. A shared image belongs to
-    the model with which it has most matches.
-    """
-    if len(made) < 2:
-        return tuple(made)
-    place = {name: index for index, name in enumerate(made[0].ids)}
-    members = [set(one.poses) for one in made]
-    changed = True
-    while changed:
-        changed = False
-        for name in place:
-            ties = [
-                int(made[0].all_matches[place[name], [place[one] for one in group - {name}]].sum()) for group in members
-            ]
-            for group, tie in zip(members, ties, strict=True):
-                if name in group and tie < max(ties):
-                    group.remove(name)
-                    changed = True
-    left = [one.without(one.poses.keys() - group) for one, group in zip(made, members, strict=True) if len(group) > 1]
-    return tuple(sorted(left, key=lambda one: -len(one.poses)))
-
-
-def _worth(made: Reconstruction) -> float:
-    share = len(made.contradictions) / (NEARBY * len(made.poses))
-    return len(made.poses) * (1.0 - COST_OF_CONTRADICTION * share)
-
-
-def contradictions(
-    poses: Mapping[str, FloatArray],
-    names: Sequence[str],
-    counts: NDArray[np.int64],
-    points: Mapping[str, FloatArray],
-) -> tuple[tuple[str, str], ...]:
-    """Pairs of neighbouring images of ``poses``, in sight of each other, that hardly match.
-
-    ``counts`` (V, V) are the numbers of matches of all ``names``, ``points`` (K, 3) the points that each image sees.
-    """
-    inside = [index for index, name in enumerate(names) if name in poses]
-    centres = np.stack([camera_centre(poses[names[index]]) for index in inside])
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
-    np.fill_diagonal(apart, np.inf)
-    best = counts.max(axis=1)
-    found = []
-    for row, index in enumerate(inside):
-        for place in np.argsort(apart[row])[: min(NEARBY, len(inside) - 1)]:
-            other = inside[int(place)]
-            if counts[index, other] >= MIN_SUPPORT * min(best[index], best[other]):
-                continue
-            here, there = centres[row], centres[int(place)]
-            if _sees_past(points[names[index]], here, there) and _sees_past(points[names[other]], there, here):
-                found.append((names[index], names[other]))
-    return tuple(found)
-
-
-def _sees_past(points: FloatArray, centre: FloatArray, other: FloatArray) -> bool:
-    """Whether the points (K, 3) that a camera at ``centre`` sees in the direction of another camera lie behind it.
-
-    With a wall between the two cameras they would lie in front of it; such cameras need not match.
-    """
-    rays, way = points - centre, other - centre
-    depth, distance = np.linalg.norm(rays, axis=1), float(np.linalg.norm(way))
-    near = rays @ way > np.cos(SIGHT_RAD) * depth * distance
-    return bool(np.count_nonzero(near) >= SIGHT_POINTS and np.median(depth[near]) > SIGHT_FACTOR * distance)
-
-
-def points_of(model: Any) -> dict[str, FloatArray]:
-    """The points (K, 3) that each image of a model sees, by its name."""
-    found = {}
-    for image in _registered(model):
-        ids = [point.point3D_id for point in image.points2D if point.has_point3D()]
-        found[image.name] = np.array([model.point3D(one).xyz for one in ids]).reshape(-1, 3)
-    return found
-
-
-def _registered(model: Any) -> list[Any]:
-    return [model.image(number) for number in model.reg_image_ids()]
 
 
 def _key(views: Sequence[View], how: FrontendOptions) -> str:
@@ -399,8 +234,9 @@ def _camera_in(pycolmap: Any, database: Any, camera: Camera) -> tuple[int, int]:
 
 def _matched(
     database: Any, ids: Sequence[int], compared: ImagePairs, waiting: Sequence[Pair], tell: Tell
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Numbers of matches (V, V) of each pair that fit a relative pose, and the same of pairs taken from one place.
+) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[Pair, int]]:
+    """Numbers of matches (V, V) of each pair that fit a relative pose, the same of pairs taken from one place, and that
+    of pairs that may show one thing at two places, which are not counted before.
 
     The matches are written into the database. Pairs whose rotation disagrees with others have none.
     """
@@ -418,12 +254,12 @@ def _matched(
         done += 1
         tell("pairs of images matched", done, len(waiting))
     same_place = {pair: found.pop(pair) for pair in sorted(found) if compared.same_place(found[pair])}
-    found = {
-        pair: geometry
+    one_thing = {
+        pair: len(geometry.inlier_matches)
         for pair, geometry in found.items()
-        if not compared.on_one_thing(*pair, database.read_matches(*_of(ids, pair)), geometry)
+        if compared.on_one_thing(*pair, database.read_matches(*_of(ids, pair)), geometry)
     }
-    found = _agreeing(found)
+    found = _agreeing({pair: geometry for pair, geometry in found.items() if pair not in one_thing})
     known = {pair: relative(geometry) for pair, geometry in found.items()}
     between = {pair: middles for pair, middles in open_triangles(known).items() if pair not in same_place}
 
@@ -442,7 +278,7 @@ def _matched(
             if database.exists_two_view_geometry(*_of(ids, pair)):
                 database.delete_two_view_geometry(*_of(ids, pair))
             database.write_two_view_geometry(*_of(ids, pair), geometry)
-    return _counts(_agreeing(found), len(ids)), _counts(same_place, len(ids))
+    return _counts(_agreeing(found), len(ids)), _counts(same_place, len(ids)), one_thing
 
 
 def _agreeing(found: Mapping[Pair, Any]) -> dict[Pair, Any]:

@@ -11,8 +11,8 @@ from spherloc.frontend.masks import Masks
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.mapping.advice import advice
+from spherloc.mapping.model import Reconstruction
 from spherloc.mapping.photographs import NewImages
-from spherloc.mapping.reconstruction import Reconstruction
 from spherloc.mapping.scene_files import (
     MODEL,
     SCENE,

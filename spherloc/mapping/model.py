@@ -1,0 +1,188 @@
+"""A model that COLMAP made, where it contradicts itself, and the parts into which it is then cut.
+
+Places that look alike (two hotel rooms, a row of houses) give wrong matches that fit a pose. A map that takes such
+places for one puts photographs next to each other that have hardly a match although nothing is between them: a
+contradiction. The map is then cut where fewest matches connect it.
+"""
+
+import copy
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.geometry import camera_centre
+from spherloc.types import FloatArray
+
+NEARBY = 2
+"""Number of nearest images in the map that should match an image."""
+MIN_SUPPORT = 0.15
+"""Least number of matches of two nearby images, as a share of those of either image's best pair; fewer contradict."""
+SIGHT_RAD, SIGHT_POINTS, SIGHT_FACTOR = np.radians(25.0), 8, 1.2
+"""An image sees past another camera if it has at least the second number of points within the first angle around the
+direction of that camera, and half of them are farther away than the camera by the third factor."""
+COST_OF_CONTRADICTION = 4.0
+"""Weight of the share of contradictions when two maps are compared by their share of images."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """A model that COLMAP could make."""
+
+    model: Any
+    """``pycolmap.Reconstruction``."""
+    poses: dict[str, FloatArray]
+    """Poses (3, 4) from the model's frame, which has no scale and no up, by name of a registered image."""
+    matches: NDArray[np.int64]
+    """(V, V) number of matches of each pair of images after the two-view check."""
+    contradictions: tuple[tuple[str, str], ...]
+    """Names of pairs of images that the model puts next to each other and in sight of each other, but that hardly
+    match."""
+    all_matches: NDArray[np.int64]
+    """(V, V) like ``matches``, but with pairs of images that were taken from one place."""
+    database: Path
+    """COLMAP's database with features and matches of all images."""
+    ids: dict[str, int]
+    """Ids of all images in the database, by name."""
+
+    def without(self, names: Collection[str]) -> "Reconstruction":
+        """The model without the images ``names``, and without points that fewer than two of the other images see."""
+        for number in list(self.model.reg_image_ids()):
+            image = self.model.image(number)
+            if image.name in names:
+                self.model.deregister_frame(image.frame_id)
+        poses = {name: pose for name, pose in self.poses.items() if name not in names}
+        against = tuple(pair for pair in self.contradictions if not set(pair) & set(names))
+        return replace(self, poses=poses, contradictions=against)
+
+    def judged(self) -> "Reconstruction":
+        """The model with its contradictions computed anew."""
+        against = contradictions(self.poses, list(self.ids), self.all_matches, points_of(self.model))
+        return replace(self, contradictions=against)
+
+    def points(self) -> FloatArray:
+        """Positions (N, 3) of the points in the model's present frame."""
+        return np.array([point.xyz for point in self.model.points3D.values()]).reshape(-1, 3)
+
+    def depths(self) -> FloatArray:
+        """Distance (N,) of each point to an image that sees it, in units of the model's present frame."""
+        centres = {number: self.model.image(number).projection_center() for number in self.model.reg_image_ids()}
+        points = self.model.points3D.values()
+        seen_from = [centres[point.track.elements[0].image_id] for point in points]
+        return np.linalg.norm(self.points() - np.reshape(seen_from, (-1, 3)), axis=1)
+
+
+def parted(made: Reconstruction) -> list[Reconstruction]:
+    """The model cut until no two images contradict each other: parts of two images or more, the largest first.
+
+    A contradiction says that two images do not belong next to each other, so somewhere between them the model takes two
+    similar places for one. The cut that separates the two images with the fewest matches is made there.
+    """
+    if not made.contradictions:
+        return [made]
+    place = {name: index for index, name in enumerate(made.ids)}
+    graph = nx.Graph()
+    graph.add_nodes_from(made.poses)
+    for one, other in combinations(made.poses, 2):
+        if matches := int(made.all_matches[place[one], place[other]]):
+            graph.add_edge(one, other, capacity=matches)
+    cuts = [nx.minimum_cut(graph, *pair) for pair in sorted(set(map(_sorted, made.contradictions)))]
+    _, (first, second) = min(cuts, key=lambda cut: cut[0])
+    parts = []
+    for side in (first, second):
+        if len(made.poses.keys() - side) > 1:
+            part = replace(made, model=copy.deepcopy(made.model)).without(side)
+            parts += parted(part.judged())
+    return sorted(parts, key=lambda part: -len(part.poses))
+
+
+def _sorted(pair: tuple[str, str]) -> tuple[str, str]:
+    return (min(pair), max(pair))
+
+
+def untangled(made: Sequence[Reconstruction]) -> tuple[Reconstruction, ...]:
+    """The models without images that have more matches with those of another one, the largest first.
+
+    Models that share images and yet could not be joined take two places for one somewhere. A shared image belongs to
+    the model with which it has most matches.
+    """
+    if len(made) < 2:
+        return tuple(made)
+    place = {name: index for index, name in enumerate(made[0].ids)}
+    members = [set(one.poses) for one in made]
+    changed = True
+    while changed:
+        changed = False
+        for name in place:
+            ties = [
+                int(made[0].all_matches[place[name], [place[one] for one in group - {name}]].sum()) for group in members
+            ]
+            for group, tie in zip(members, ties, strict=True):
+                if name in group and tie < max(ties):
+                    group.remove(name)
+                    changed = True
+    left = [one.without(one.poses.keys() - group) for one, group in zip(made, members, strict=True) if len(group) > 1]
+    return tuple(sorted(left, key=lambda one: -len(one.poses)))
+
+
+def worth(made: Reconstruction) -> float:
+    """Number of images, less the more of them contradict each other."""
+    share = len(made.contradictions) / (NEARBY * len(made.poses))
+    return len(made.poses) * (1.0 - COST_OF_CONTRADICTION * share)
+
+
+def contradictions(
+    poses: Mapping[str, FloatArray],
+    names: Sequence[str],
+    counts: NDArray[np.int64],
+    points: Mapping[str, FloatArray],
+) -> tuple[tuple[str, str], ...]:
+    """Pairs of neighbouring images of ``poses``, in sight of each other, that hardly match.
+
+    ``counts`` (V, V) are the numbers of matches of all ``names``, ``points`` (K, 3) the points that each image sees.
+    """
+    inside = [index for index, name in enumerate(names) if name in poses]
+    centres = np.stack([camera_centre(poses[names[index]]) for index in inside])
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    best = counts.max(axis=1)
+    found = []
+    for row, index in enumerate(inside):
+        for place in np.argsort(apart[row])[: min(NEARBY, len(inside) - 1)]:
+            other = inside[int(place)]
+            if counts[index, other] >= MIN_SUPPORT * min(best[index], best[other]):
+                continue
+            here, there = centres[row], centres[int(place)]
+            if _sees_past(points[names[index]], here, there) and _sees_past(points[names[other]], there, here):
+                found.append((names[index], names[other]))
+    return tuple(found)
+
+
+def _sees_past(points: FloatArray, centre: FloatArray, other: FloatArray) -> bool:
+    """Whether the points (K, 3) that a camera at ``centre`` sees in the direction of another camera lie behind it.
+
+    With a wall between the two cameras they would lie in front of it; such cameras need not match.
+    """
+    rays, way = points - centre, other - centre
+    depth, distance = np.linalg.norm(rays, axis=1), float(np.linalg.norm(way))
+    near = rays @ way > np.cos(SIGHT_RAD) * depth * distance
+    return bool(np.count_nonzero(near) >= SIGHT_POINTS and np.median(depth[near]) > SIGHT_FACTOR * distance)
+
+
+def points_of(model: Any) -> dict[str, FloatArray]:
+    """The points (K, 3) that each image of a model sees, by its name."""
+    found = {}
+    for image in registered(model):
+        ids = [point.point3D_id for point in image.points2D if point.has_point3D()]
+        found[image.name] = np.array([model.point3D(one).xyz for one in ids]).reshape(-1, 3)
+    return found
+
+
+def registered(model: Any) -> list[Any]:
+    """The images of a model that have a pose."""
+    return [model.image(number) for number in model.reg_image_ids()]
