@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from spherloc.geometry import camera_centre
 from spherloc.types import FloatArray
 
-NEARBY = 2
-"""Number of nearest images in the map that should match an image."""
+NEARBY, NEAR = 2, 3.0
+"""Number of nearest images in the map that should match an image, if they are at most that many times as far from each
+other as each is from its nearest one: of three photographs of a walk the first and the last need not match."""
 MIN_SUPPORT = 0.15
 """Least number of matches of two nearby images, as a share of those of either image's best pair; fewer contradict."""
 SIGHT_RAD, SIGHT_POINTS, SIGHT_FACTOR = np.radians(25.0), 8, 1.2
@@ -155,6 +156,8 @@ def contradictions(
     for row, index in enumerate(inside):
         for place in np.argsort(apart[row])[: min(NEARBY, len(inside) - 1)]:
             other = inside[int(place)]
+            if apart[row, place] > NEAR * min(apart[row].min(), apart[place].min()):
+                continue
             if counts[index, other] >= MIN_SUPPORT * min(best[index], best[other]):
                 continue
             here, there = centres[row], centres[int(place)]

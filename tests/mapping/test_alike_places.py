@@ -64,6 +64,19 @@ def test_images_in_sight_of_each_other_that_hardly_match(rng):
     assert contradictions(poses, NAMES, matches_of(alike=90), near) == ()  # a wall round each
 
 
+def test_the_ends_of_a_walk_need_not_match(rng):
+    """Of three in a row, the first and the last have no match; only where they are about as near do they contradict."""
+    counts = np.array([[0, 90, 0], [90, 0, 80], [0, 80, 0]])
+    seen = dict.fromkeys("abc", walls(rng))
+
+    def at(*metres):
+        poses = {name: pose(np.eye(3), -np.array([0.0, 0.0, x])) for name, x in zip("abc", metres, strict=True)}
+        return contradictions(poses, list("abc"), counts, seen)
+
+    assert at(0.0, 0.2, 1.2) == ()
+    assert set(map(frozenset, at(0.0, 0.6, 1.2))) == {frozenset("ac")}
+
+
 def test_a_map_of_two_rooms_in_one_place_is_cut_between_them(rng):
     parts = untangled(parted(model_of(walls(rng))))
     assert [set(part.poses) for part in parts] == [ROOMS[1], ROOMS[0]]

@@ -447,7 +447,7 @@ def test_images_that_show_nothing_together(tmp_path, rng):
         make_map(
             found.views, tmp_path, tmp_path / "map", ScaleMeasurement(distance=("a.png", "z.png", 1.0)), None, print
         )
-    with pytest.raises(InputError, match="no two of the 2 photographs surely show the same place .*the best pair has"):
+    with pytest.raises(InputError, match=r"no two of the 2 photographs surely show the same place .*the best pair has"):
         make_map(found.views, tmp_path, tmp_path / "map", ScaleMeasurement(), None, lambda *_: None)
     assert not (tmp_path / "map").exists(), "a map that cannot be made leaves nothing"
 
