@@ -5,7 +5,7 @@ import numpy as np
 from spherloc.experiments.results import FAILED, LOCALIZED, QueryResult
 from spherloc.geometry import align_to_down, pose
 from spherloc_viz import style
-from spherloc_viz.layers.primitives import Points, Segments
+from spherloc_viz.layers.primitives import Label, Points, Segments
 from spherloc_viz.layers.scene import trajectory_items
 
 LIMIT_M = 1.0
@@ -19,7 +19,7 @@ def row(index: int, found: tuple[float, float, float] | None, truth: tuple[float
 
 
 def drawn(rows: list[QueryResult], map_turn: np.ndarray) -> tuple[Points, Segments, Segments]:
-    dots, truth, errors = trajectory_items(rows, map_turn, LIMIT_M)
+    dots, truth, errors, *_ = trajectory_items(rows, map_turn, LIMIT_M)
     assert isinstance(dots, Points) and isinstance(truth, Segments) and isinstance(errors, Segments)
     return dots, truth, errors
 
@@ -55,3 +55,14 @@ def test_the_ramp_spans_the_successes() -> None:
     assert all(tuple(color) == style.OUTLIER for color in colors[3:])
     assert style.error_scale(np.array([0.0, np.nan]), 2.0) == 2.0 and style.error_scale(np.array([3.0]), 2.0) == 2.0
     assert tuple(style.error_colors(np.array([0.0]), 2.0)[0]) == style.ERROR_RAMP[0]
+
+
+def test_few_queries_are_named_above_their_dots() -> None:
+    turn = align_to_down(np.array([0.0, 0.0, -1.0]))
+    rows = [row(0, (0, 0, 0), None), row(1, None, None), row(2, (2, 0, 0), None)]
+    dots, _, _, *names = trajectory_items(rows, turn, LIMIT_M)
+    assert isinstance(dots, Points)
+    for name, text, place in zip(names, ("q0", "q2"), dots.positions, strict=True):
+        assert isinstance(name, Label) and name.text == text
+        assert name.position[1] < place[1] and np.allclose(name.position[[0, 2]], place[[0, 2]])
+    assert len(trajectory_items([row(k, (k, 0, 0), None) for k in range(13)], turn, LIMIT_M)) == 3

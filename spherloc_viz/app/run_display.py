@@ -179,7 +179,10 @@ class RunDisplay:
         if last and alternative is not None:
             picture = with_alternative(picture, trace, alternative)
         drawn = with_selection(picture, trace, selected)
-        drawn = replace(drawn, scene=drawn.scene + controls.items(known, hidden) + self._cloud(run, drawn.step.stage))
+        beside = controls.items(known, hidden)
+        if drawn.step.stage not in NAMED_AT:
+            beside = tuple(item for item in beside if not (isinstance(item, Label) and item.layer == "trajectory"))
+        drawn = replace(drawn, scene=drawn.scene + beside + self._cloud(run, drawn.step.stage))
         self._shown = known, mesh, drawn
         with self._client.atomic():
             self._follow_theme()

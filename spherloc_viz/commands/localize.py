@@ -310,6 +310,8 @@ def _text(results: SequenceResults, summary: Summary) -> str:
     lines += [f"  {line}" for line in (*_skipped(summary), *_each(results), *_without_pose(results.rows))]
     if not timed(results):
         lines.append("  trajectory: times are places in the sequence, as the queries have no growing times")
+    if (picture := results.folder / PICTURE).exists():
+        lines.append(f"  picture: {picture}")
     return "\n".join([*lines, f"  written to {results.folder}"])
 
 

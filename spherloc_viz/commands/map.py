@@ -94,8 +94,9 @@ def make(
     print(f"report        {report}")
     if others is not None:
         print(f"new images    {_sizes(others)}")
-    print(f"see it        spherloc play {made.written.scene}")
-    print(f"localize      spherloc localize {made.written.new_scene or made.written.scene}")
+    scene = made.written.new_scene or made.written.scene
+    print(f"see it        spherloc play {scene}")
+    print(f"localize      spherloc localize {scene}")
     for group in made.groups if others is not None else ():
         print(f"or there      spherloc localize {group.written.new_scene}")
     return 0 if len(made.written.poses) == len(found.views) else 1

@@ -253,7 +253,8 @@ def _from_above(made: Map, cameras: Collection[Camera], unit: str) -> str:
         axes.set(xlabel=unit, ylabel=unit)
         axes = figure.add_subplot(1, 2, 2, aspect="equal", adjustable="datalim", title="the cameras alone")
     if len(cameras) == 1:  # those of several do not follow each other by their names
-        axes.plot(centres[:, 0], centres[:, 1], color="#d08a1c", linewidth=0.8)
+        walk = np.stack([camera_centre(made.written.poses[name]) for name in sorted(made.written.poses)])
+        axes.plot(walk[:, 0], walk[:, 1], color="#d08a1c", linewidth=0.8)
     axes.scatter(centres[:, 0], centres[:, 1], s=28, c="#c0392b", zorder=3)
     if len(centres) <= MAX_NAMED:
         for name, centre in zip(made.written.poses, centres, strict=True):

@@ -17,7 +17,7 @@ SHARE, REACH = 0.9, 2.0
 DOT, REFERENCE_DOT = 0.0007, 0.01
 """Radius of a point's dot, as a share of the extent of the points, and of a reference's, of that of the references."""
 MAX_NAMED = 12
-"""Largest number of references whose names are shown."""
+"""Largest number of references, and of localized queries, whose names are shown."""
 REFERENCES = "cloud/references"
 """Name of the dots where the references were taken."""
 

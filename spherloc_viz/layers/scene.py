@@ -15,6 +15,7 @@ from spherloc.problem import Problem
 from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers.frame import Frame, RunView, icosphere, one_color
+from spherloc_viz.layers.point_cloud import MAX_NAMED
 from spherloc_viz.layers.primitives import Label, Mesh, Points, SceneItem, Segments, Textured
 from spherloc_viz.layers.query_image import modified, sphere_texture
 from spherloc_viz.layers.uncertainty import error_items, is_close_up
@@ -247,8 +248,8 @@ def trajectory_items(rows: Sequence[QueryResult], map_turn: FloatArray, limit_m:
     """Primitives of a localized sequence.
 
     ``rows`` are in the order of the sequence, ``map_turn`` (3, 3) turns the map to the aligned map, and ``limit_m``
-    is the loosest limit of success. Poses whose truth is unknown have the estimate's colour; a query without a pose is
-    a dot in the outliers' colour where it truly was.
+    is the loosest limit of success. Few queries are named. Poses whose truth is unknown have the estimate's colour; a
+    query without a pose is a dot in the outliers' colour where it truly was.
     """
     truth = np.array([row.true_position_m for row in rows]).reshape(-1, 3) @ map_turn.T
     found = np.array([row.position_m for row in rows]).reshape(-1, 3) @ map_turn.T
@@ -265,8 +266,11 @@ def trajectory_items(rows: Sequence[QueryResult], map_turn: FloatArray, limit_m:
     ids = np.flatnonzero(shown)
     steps = np.linalg.norm(np.diff(places[shown], axis=0), axis=1)
     dot_m = DOT_SHARE * float(np.median(steps)) if len(steps) else limit_m
+    above = np.array([0.0, -3.0 * dot_m, 0.0])  # names of the map's images are below their dots
+    names = [Label(f"trajectory/name-{k}", "trajectory", places[k] + above, rows[k].query) for k in ids.tolist()]
     return (
         Points("trajectory/queries", "trajectory", places[shown], colors[shown], dot_m, ids),
         Segments("trajectory/truth", "trajectory", legs, one_color(style.TRUTH, len(legs)), 2.0),
         Segments("trajectory/errors", "trajectory", offsets, colors[both], 2.0),
+        *(names if len(names) <= MAX_NAMED else ()),
     )

@@ -9,7 +9,7 @@ import viser
 
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import SpherlocError
-from spherloc.experiments.results import QueryResult
+from spherloc.experiments.results import LOCALIZED, QueryResult
 from spherloc.experiments.sequence import localize
 from spherloc.experiments.summary import success_rates
 from spherloc.trace import Trace
@@ -128,8 +128,9 @@ def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
         (f"within {rate.degrees:g}° and {rate.metres:g} {unit}", f"{rate.successes} of {rate.judged}") for rate in rates
     ]
     done = ("queries", f"{len(rows)} of {len(scene.queries)}")
+    located = ("localized", f"{sum(row.status == LOCALIZED for row in rows)} of {len(rows)}")
     limit_m = scene.thresholds[-1][1]
     errors = [row.translation_error_m for row in rows if row.translation_error_m is not None]
     scale, small = (100.0, "cm") if scene.metric else (1.0, unit)
     worst = f"{scale * error_scale(np.array(errors), limit_m):.2g} {small}; red beyond {limit_m:g} {unit}"
-    return table_html(Table("sequence", ("", ""), (done, *lines))) + (ramp_html("0", worst) if errors else "")
+    return table_html(Table("sequence", ("", ""), (done, located, *lines))) + (ramp_html("0", worst) if errors else "")

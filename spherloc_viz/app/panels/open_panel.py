@@ -71,7 +71,7 @@ def _folder_html(listing: Listing, in_map: str) -> str:
             rows.append(_row_html(f"open-folder:0:{row.place}", f"{row.name}/", ""))
         else:
             rows.append(_scene_html(row))
-    if not listing.rows:
+    if not listing.rows and not listing.photographs:
         rows.append(_row_html(None, "no folders and no scene files (*.toml)", ""))
     pages = ""
     if listing.pages > 1:
@@ -186,7 +186,7 @@ class OpenPanel:
     ) -> None:
         """``roots`` are the folders that may be looked into; ``open_scene`` is called on a thread of this panel, and
         ``at_hand`` gives the file of the scene that the page shows."""
-        self._open_scene, self._at_hand = open_scene, at_hand
+        self._open_scene, self._at_hand, self._touches = open_scene, at_hand, touches
         self._roots, self._recent = Roots(roots), recent or RecentScenes()
         self._scratch = Scratch()
         self._background = BackgroundWorker(f"spherloc-open-{client.client_id}", self._complain)
@@ -195,7 +195,7 @@ class OpenPanel:
         self._files: dict[str, File] = {}
         self._bundled: list[Row] = []
         self._status = gui.add_html("", visible=False)
-        self._map = MapPanel(gui, lambda path: self._background.ask(lambda: self._open_file(path)))
+        self._map = MapPanel(gui, lambda path: self._background.ask(lambda: self._open_at_outcome(path)))
         with gui.add_folder("Upload matches", expand_by_default=False):
             self._build_form(gui)
         self._list = gui.add_html("")
@@ -282,15 +282,21 @@ class OpenPanel:
             raise InputError("the map that is shown is not in an allowed folder; open a map from the list first.")
         self._say("Looking at the photographs …")
         path, remarks = add_new_images(scene, folder)
-        self._open_file(path)
+        self._open_at_outcome(path)
         self._say(" ".join(remarks))
+
+    def _open_at_outcome(self, path: Path) -> None:
+        """Open a scene of photographs: where they were taken is what is to be seen first."""
+        self._open_file(path)
+        self._touches.deliver(Touch("step", "outcome", 0.0, 0.0, 0.0, 0.0, False))
 
     def _map_for(self, listing: Listing) -> str:
         """The name of the map at hand, if other photographs than its own are listed; else empty."""
         scene = self._at_hand()
         try:
             images = None if self._place(scene) is None else map_images(scene)
-            own = images is not None and images.resolve() == listing.folder.resolve()
+            # Of the folder above it, the map's own photographs would be localized too.
+            own = images is not None and images.resolve().is_relative_to(listing.folder.resolve())
         except (InputError, OSError, RuntimeError):
             return ""
         return "" if images is None or own else f"the map of {images.name}"
