@@ -16,7 +16,8 @@ from spherloc.trace import Trace
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.views import Walls
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.primitives import Focus, Label, Mesh, Segments
+from spherloc_viz.layers.point_cloud import REFERENCES
+from spherloc_viz.layers.primitives import Focus, Label, Mesh, Points, Segments
 
 
 @pytest.fixture(scope="module")
@@ -130,3 +131,22 @@ def test_the_sphere_does_not_stand_before_a_ball(trace: Trace) -> None:
         along = np.linspace(0.0, 1.0, 200)[:, None]
         apart_m = np.linalg.norm(position + along * (ball - position) - centre, axis=1)
         assert apart_m.min() > radius_m, np.degrees(turn)
+
+
+def test_from_above_one_sees_where_the_photographs_were_taken(trace: Trace) -> None:
+    """If that is a small part of the map; else the whole map."""
+    picture = paint(trace, len(steps(trace)) - 1)
+    (camera,) = (item for item in picture.scene if item.name == "cameras/estimate")
+    assert isinstance(camera, Segments)
+    here, whole = camera.points[0, 0], views.find("Above", picture, 1.5)
+
+    def seen(metres: float) -> tuple[views.Viewpoint, np.ndarray]:
+        walk = here + metres * np.array([[-0.5, 0.0, 0.0], [0.0, 0.0, 0.2], [0.5, 0.0, 0.0]])
+        dots = Points(REFERENCES, "cloud", walk, np.zeros((3, 3), np.uint8), 0.1)
+        view = views.find("Above", replace(picture, scene=(*picture.scene, dots)), 1.5)
+        return view, views.projected(view, walk) / np.tan(view.field_of_view_rad / 2)
+
+    near, at = seen(1.0)
+    assert np.all(np.abs(at) < [1.5, 1.0]) and np.ptp(at[:, 0]) > 1.0
+    assert near.position[1] > whole.position[1] + 5.0
+    np.testing.assert_allclose(seen(8.0)[0].position, whole.position, atol=0.1)

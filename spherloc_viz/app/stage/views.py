@@ -413,6 +413,11 @@ def _in_the_way(standing: FloatArray, targets: FloatArray, positions: FloatArray
     return np.sum(before * (distance / np.maximum(depth, 1e-3)) ** 2, axis=1)
 
 
+SMALL_WALK, WALK_ROOM = 1.0 / 3.0, 0.4
+"""If photographs were taken in a part of the map that is smaller than this share of it, the view from above shows that
+part, with room around it, as a share of its size."""
+
+
 def _subject(name: str, picture: Picture) -> FloatArray:
     """Points (K, 3) that a view must hold."""
     items = {item.name: item for item in picture.scene}
@@ -432,7 +437,14 @@ def _subject(name: str, picture: Picture) -> FloatArray:
         for item in picture.scene
         if isinstance(item, Points) and (item.layer == "trajectory" or item.name == REFERENCES)
     ]
-    return np.vstack([dense_points(points.positions), surface.vertices, *lines, *route])
+    dense = dense_points(points.positions)
+    if name == "Above" and route:
+        camera = items.get("cameras/estimate")
+        taken = np.vstack([*route, camera.points[:1, 0]] if isinstance(camera, Segments) else route)
+        extent_m = float(np.ptp(taken, axis=0).max())
+        if 0.0 < extent_m < SMALL_WALK * float(np.ptp(dense, axis=0).max()):
+            return np.vstack([taken - WALK_ROOM * extent_m, taken + WALK_ROOM * extent_m])
+    return np.vstack([dense, surface.vertices, *lines, *route])
 
 
 def _sphere(surface: object, ring: bool) -> FloatArray:
