@@ -49,6 +49,8 @@ MAX_HEADINGS = 60
 """About how many directions of view are drawn."""
 ARROWS = 20.0
 """So many arrows of directions of view are as long as the picture is wide."""
+BESIDE = 2.0
+"""Images of the map this near to the middle of the queries, in halves of their extent, are framed with them."""
 FEWEST_FRAMED = 3
 """Number of believed poses from which on the picture is framed by them, and not by doubtful ones too."""
 
@@ -64,17 +66,19 @@ class Backdrop:
     """(P, 3), map frame, metres; none if the map has no points."""
     images: FloatArray
     """(R, 3) positions of the map's images, map frame, metres."""
+    names: tuple[str, ...] = ()
+    """(R,) their names; none if they are not known."""
 
 
 def backdrop_of(scene: MapScene) -> Backdrop:
     """The points and images of a scene's map."""
-    centres = [camera_centre(view.cam_from_map) for view in scene.references if view.cam_from_map is not None]
-    images = np.reshape(centres, (-1, 3))
+    taken = {view.name: camera_centre(view.cam_from_map) for view in scene.references if view.cam_from_map is not None}
+    images = np.reshape(list(taken.values()), (-1, 3))
     points = np.zeros((0, 3)) if scene.cloud is None else np.asarray(scene.cloud, dtype=np.float64)
     if len(points) and len(images):
         away = np.linalg.norm(points - np.median(images, axis=0), axis=1)
         points = points[away <= np.quantile(away, WITHIN)]
-    return Backdrop(points[:: ceil(max(1, len(points)) / MAX_POINTS)], images)
+    return Backdrop(points[:: ceil(max(1, len(points)) / MAX_POINTS)], images, tuple(taken))
 
 
 @contextmanager
@@ -97,7 +101,9 @@ def trajectory_png(results: SequenceResults, backdrop: Backdrop) -> bytes:
     true_places = _from_above(results, results.true_positions_m)
     believed = np.where(_are_doubtful(results)[:, None], np.nan, places)
     framed = believed if np.isfinite(believed).all(axis=1).sum() >= FEWEST_FRAMED else places
-    figure, panels = _panels(results, _frames(results, _frame(_true_if_known(framed, true_places)), backdrop), 1.6)
+    images = _from_above(results, backdrop.images)
+    own = _with_near(_true_if_known(framed, true_places), images)
+    figure, panels = _panels(results, _frames(results, own, backdrop), 1.6)
     for axes in panels:
         _map(axes, results, backdrop)
     if len(panels) > 1:
@@ -110,8 +116,23 @@ def trajectory_png(results: SequenceResults, backdrop: Backdrop) -> bytes:
     _title(figure, f"{results.configuration.name}: {_about(results)}")
     _legend(figure, axes)
     free = np.concatenate([places[np.isfinite(places).all(axis=1)], arrows])
-    write_labels(axes, _named(axes, results, places, true_places), free)
+    named = _named(axes, results, places, true_places)
+    write_labels(axes, [*named, *_named_images(axes, backdrop.names, images)], free)
     return _png(figure)
+
+
+def _with_near(places: FloatArray, images: FloatArray) -> Frame:
+    """The frame of the queries' places (N, 2), with those of the map's images (R, 2) that are beside it."""
+    middle, half = _frame(places)
+    near = (np.abs(images - middle) <= BESIDE * half.max()).all(axis=1)
+    return _frame(np.concatenate([places, images[near]]))
+
+
+def _named_images(axes: Axes, names: Sequence[str], images: FloatArray) -> list[PlaceName]:
+    """The names of the map's images in the picture, if they are few."""
+    drawn = np.flatnonzero(_inside(axes, images)) if names else []
+    few = drawn if len(drawn) <= MAX_NAMED else []
+    return [PlaceName(names[k], images[k], css(REFERENCE)) for k in few]
 
 
 def _frames(results: SequenceResults, own: Frame, backdrop: Backdrop) -> list[Frame]:
@@ -192,7 +213,7 @@ def _map(axes: Axes, results: SequenceResults, backdrop: Backdrop) -> None:
 def _overview(axes: Axes, detail: Axes, places: FloatArray, true_places: FloatArray) -> None:
     """Mark in the panel of the whole map where the other panel is, and the positions."""
     axes.set_title("in the map", fontsize=10)
-    detail.set_title("the queries alone: the frame on the left", fontsize=10)
+    detail.set_title("the queries: the frame on the left", fontsize=10)
     (left, right), (bottom, top) = detail.get_xlim(), detail.get_ylim()
     axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, fill=False, linewidth=1.0, color="0.2"))
     axes.plot(*true_places.T, ".", color=css(TRUTH), markersize=3.0)

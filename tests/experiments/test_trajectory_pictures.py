@@ -145,3 +145,13 @@ def test_unordered_photographs_are_not_joined(figure_of):
 def test_a_map_without_points_or_results_is_drawn():
     empty = Backdrop(np.zeros((0, 3)), np.zeros((0, 3)))
     assert trajectory_png(results(without_pose(0, "街.png")), empty).startswith(b"\x89PNG")
+
+
+def test_images_of_the_map_beside_the_queries_are_framed_and_named(figure_of):
+    rows = [query(0, "new_0", 0.0, 0.0), query(1, "new_1", 4.0, 0.0)]
+    images = np.array([[-1.0, 0.0, 1.5], [2.0, 0.0, 1.5], [6.0, 0.0, 1.5], [60.0, 0.0, 1.5]])
+    street = Backdrop(np.random.default_rng(3).uniform(-60.0, 60.0, (800, 3)), images, ("a", "b", "c", "far"))
+    _, near = figure_of(trajectory_png, results(*rows), street).axes
+    left, right = near.get_xlim()
+    assert left < -1.0 and 6.0 < right < 20.0
+    assert {"a", "b", "c", "new_0", "new_1"} == set(names_in(near))
