@@ -194,11 +194,14 @@ def _cell(view: View, picture: str, row: QueryResult | None, unit: str) -> str:
         if picture
         else f'<div style="width:{HEIGHT_PX}px;height:{HEIGHT_PX}px;background:rgba(128,140,160,.2)"></div>'
     )
+    # As wide as the picture; of a longer name the end is shown, which tells queries apart.
+    cut = "width:0;min-width:100%;overflow:hidden;text-overflow:ellipsis;white-space:nowrap;direction:rtl"
+    name = f'<div aria-hidden="true" style="{cut};text-align:center;{DIM}"><bdi>{escape(view.name)}</bdi></div>'
     return (
         f'<div role="listitem"><div role="button" tabindex="0" data-touch="strip-open:{escape(view.name)}" '
         f'title="{escape(said)}" aria-label="{escape(said)}" '
         f'style="position:relative;border:{border};border-radius:4px;cursor:pointer;overflow:hidden">{image}{mark}'
-        "</div></div>"
+        f"</div>{name}</div>"
     )
 
 
