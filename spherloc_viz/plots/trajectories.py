@@ -130,7 +130,7 @@ def _with_near(places: FloatArray, images: FloatArray) -> Frame:
 
 def _named_images(axes: Axes, names: Sequence[str], images: FloatArray) -> list[PlaceName]:
     """The names of the map's images in the picture, if they are few."""
-    drawn = np.flatnonzero(_inside(axes, images)) if names else []
+    drawn = np.flatnonzero(_inside(axes, images)).tolist() if names else []
     few = drawn if len(drawn) <= MAX_NAMED else []
     return [PlaceName(names[k], images[k], css(REFERENCE)) for k in few]
 
