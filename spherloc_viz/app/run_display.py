@@ -180,9 +180,11 @@ class RunDisplay:
             picture = with_alternative(picture, trace, alternative)
         drawn = with_selection(picture, trace, selected)
         beside = controls.items(known, hidden)
-        if drawn.step.stage not in NAMED_AT:
-            beside = tuple(item for item in beside if not (isinstance(item, Label) and item.layer == "trajectory"))
-        drawn = replace(drawn, scene=drawn.scene + beside + self._cloud(run, drawn.step.stage))
+        names = {item.name for item in beside if isinstance(item, Label) and item.layer == "trajectory"}
+        # Where queries are named, the name of the ellipsoid would lie over that of the one at hand.
+        left_out = {"uncertainty/sigmas"} if names and drawn.step.stage in NAMED_AT else names
+        scene = drawn.scene + beside + self._cloud(run, drawn.step.stage)
+        drawn = replace(drawn, scene=tuple(item for item in scene if item.name not in left_out))
         self._shown = known, mesh, drawn
         with self._client.atomic():
             self._follow_theme()
