@@ -134,7 +134,7 @@ def test_the_sphere_does_not_stand_before_a_ball(trace: Trace) -> None:
 
 
 def test_from_above_one_sees_where_the_photographs_were_taken(trace: Trace) -> None:
-    """If that is a small part of the map; else the whole map."""
+    """If that is a small part of the map, and the camera has a position; else the whole map."""
     picture = paint(trace, len(steps(trace)) - 1)
     (camera,) = (item for item in picture.scene if item.name == "cameras/estimate")
     assert isinstance(camera, Segments)
@@ -150,3 +150,9 @@ def test_from_above_one_sees_where_the_photographs_were_taken(trace: Trace) -> N
     assert np.all(np.abs(at) < [1.5, 1.0]) and np.ptp(at[:, 0]) > 1.0
     assert near.position[1] > whole.position[1] + 5.0
     np.testing.assert_allclose(seen(8.0)[0].position, whole.position, atol=0.1)
+    first = paint(trace, 0)
+    before, after = (
+        views.find("Above", replace(first, scene=(*first.scene, *dots)), 1.5)
+        for dots in ((), (Points(REFERENCES, "cloud", here + np.eye(3), np.zeros((3, 3), np.uint8), 0.1),))
+    )
+    np.testing.assert_allclose(before.position, after.position, atol=1.0)

@@ -438,9 +438,9 @@ def _subject(name: str, picture: Picture) -> FloatArray:
         if isinstance(item, Points) and (item.layer == "trajectory" or item.name == REFERENCES)
     ]
     dense = dense_points(points.positions)
-    if name == "Above" and route:
-        camera = items.get("cameras/estimate")
-        taken = np.vstack([*route, camera.points[:1, 0]] if isinstance(camera, Segments) else route)
+    camera = items.get("cameras/estimate")
+    if name == "Above" and route and isinstance(camera, Segments):  # without a position, the sphere is elsewhere
+        taken = np.vstack([*route, camera.points[:1, 0]])
         extent_m = float(np.ptp(taken, axis=0).max())
         if 0.0 < extent_m < SMALL_WALK * float(np.ptp(dense, axis=0).max()):
             return np.vstack([taken - WALK_ROOM * extent_m, taken + WALK_ROOM * extent_m])
