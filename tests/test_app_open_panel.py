@@ -179,7 +179,9 @@ def test_folders_of_cameras_are_offered_as_one_map_unless_a_link_leads_out(visit
 
 
 def test_photographs_are_localized_in_the_map_at_hand(visitor: Visitor, folder: Path, rng: np.random.Generator) -> None:
-    """They become queries of a scene beside the map's own, which is opened."""
+    """They become queries of a scene beside the map's own, which is opened at its outcome."""
+    went: list[str] = []
+    visitor.touches.on("step", lambda touch: went.append(touch.argument))
     own, later = [f"seq/{k:03}.jpg" for k in range(4)], ["image_0.png", "image_1.png"]
     for path in (*(folder / "home" / name for name in own), *(folder / "later" / name for name in later)):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -194,9 +196,14 @@ def test_photographs_are_localized_in_the_map_at_hand(visitor: Visitor, folder: 
     assert visitor.said == ""
     visitor.touch("open-folder:0:0:home")
     assert "localize-folder:0:home" not in visitor.rows, "these are the map's own"
+    visitor.touch("open-folder:0:0:")
+    assert not [row for row in visitor.rows if row.startswith("localize-folder")], "the map's own are below it"
     visitor.touch("open-folder:0:0:later")
+    assert "no folders and no scene files" not in visitor.panel._list.content
     assert "Localize these 2 photographs in the map of home" in visitor.panel._list.content
+    assert went == []
     visitor.touch("localize-folder:0:later")
+    assert went == ["outcome"]
     opened = visitor.opened[-1]
     assert opened.path == folder / "home_map" / "later.toml" and opened.label == "later in home (units unknown)"
     assert isinstance(opened.scene, MapScene)

@@ -20,6 +20,7 @@ from spherloc.cameras.mei import Mei
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.errors import CalibrationError, InputError
 from spherloc.formats.colmap_files import read_model
+from spherloc.frontend import trained
 from spherloc.frontend.masks import Masks
 from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.advice import COMMAND, PAGE, for_a_page
@@ -39,7 +40,7 @@ from spherloc.mapping.photographs import (
 from spherloc.mapping.scene_files import _camera, _queries
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
 from spherloc.problem import Problem
-from spherloc_viz.commands.map import _kind, _sizes, cameras_of_file, main
+from spherloc_viz.commands.map import _kind, _sizes, cameras_of_file, how_of, main
 from spherloc_viz.commands.map_report import map_report, summary
 from tests.waiting import LIMIT_S
 
@@ -103,6 +104,14 @@ def test_panoramas_straight_ahead_of_each_other_are_mapped(walk, tmp_path):
         assert abs(way[2]) > 0.99 * np.linalg.norm(way)
     made = make_map(views, views[0].path.parent, tmp_path / "map", ScaleMeasurement(), None, lambda *_: None)
     assert len(made.written.poses) == 3
+
+
+@pytest.mark.parametrize(("installed", "features"), [(True, "sift+aliked"), (False, "sift")])
+def test_the_best_installed_features_are_matched(monkeypatch, installed, features):
+    monkeypatch.setattr(trained, "installed", lambda: installed)
+    how = how_of()
+    assert (how.features.method, how.matching.method) == (features, "lightglue" if installed else "nearest")
+    assert how_of("sift").features.method == "sift"
 
 
 def test_its_scenes_open(walk):
