@@ -40,7 +40,7 @@ from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Notices, Status
 from spherloc_viz.app.text import begun
 from spherloc_viz.app.web.touch import READY, Touch, Touches
-from spherloc_viz.app.web.viser_internals import follow_changes, guard_callbacks, is_linked, update_widget
+from spherloc_viz.app.web.viser_internals import at_once, follow_changes, guard_callbacks, is_linked, update_widget
 from spherloc_viz.app.workers import Job, LatestWorker
 from spherloc_viz.layers import steps
 from spherloc_viz.layers.withheld import TOLD
@@ -137,12 +137,14 @@ class Session:
 
     # What the user does. viser and the front door call these methods on threads of their own; they only note requests.
 
+    @at_once
     def changed(self, event: object = None) -> None:
         """A widget that a run depends on was changed on the page by its user."""
         if self._built:
             self._controls.slow.outdate()
         self._solver.ask()
 
+    @at_once
     def redraw(self, event: object = None) -> None:
         """The page is to be drawn anew."""
         self._page.ask()

@@ -162,9 +162,8 @@ def peaks(counts: np.ndarray, reach: int, most: int) -> np.ndarray:
     At a peak no count within ``reach`` places is larger, and no other peak is that close. Equal ones come in an order
     that jumps around the circle, so that a few of many do not lie side by side.
     """
-    from scipy.ndimage import maximum_filter1d  # takes a quarter of a second
-
-    highest = maximum_filter1d(counts, 2 * reach + 1, mode="wrap")
+    around = np.pad(counts, reach, mode="wrap")
+    highest = np.lib.stride_tricks.sliding_window_view(around, 2 * reach + 1).max(axis=1)
     candidates = np.flatnonzero((counts == highest) & (counts > 0))
     candidates = candidates[np.lexsort((candidates * GOLDEN % 1.0, -counts[candidates]))]
     found: list[int] = []

@@ -147,10 +147,14 @@ def reach(view: Viewpoint) -> float:
 def look(client: viser.ClientHandle, view: Viewpoint) -> None:
     """Move a client's viewer there."""
     with client.atomic():
-        camera = client.camera
-        camera.up_direction = UP
-        camera.fov = view.field_of_view_rad
-        camera.far = reach(view)
+        camera, far = client.camera, reach(view)
+        # Setting what is so already takes viser as long as drawing a ball.
+        if not np.array_equal(camera.up_direction, UP):
+            camera.up_direction = UP
+        if camera.fov != view.field_of_view_rad:
+            camera.fov = view.field_of_view_rad
+        if camera.far != far:
+            camera.far = far
         place_viewer(client, view.position, view.target)
 
 
