@@ -147,6 +147,16 @@ def test_from_above_one_sees_where_the_photographs_were_taken(trace: Trace) -> N
         return view, views.projected(view, walk) / np.tan(view.field_of_view_rad / 2)
 
     near, at = seen(1.0)
+    walk = here + np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])
+    dots = Points(REFERENCES, "cloud", walk, np.zeros((2, 3), np.uint8), 0.1)
+    outcome = replace(picture, scene=(*picture.scene, dots))
+    view = views.follow(outcome, 1.5)
+    half = views.projected(view, walk) / np.tan(view.field_of_view_rad / 2)
+    assert np.all(np.abs(half) < [1.5, 1.0]) and np.ptp(half[:, 0]) > 0.5, "so does the view of the outcome"
+    assert views.fits(None, view, outcome, 1.5) and not views.fits(None, views.follow(picture, 1.5), outcome, 1.5)
+    names = views.over_the_walk(outcome, view.position)
+    assert {"sphere/surface", "sphere/bearings"} <= names and "map/points" not in names, "it would cover them"
+    assert not views.over_the_walk(outcome, here) and not views.over_the_walk(picture, view.position)
     assert np.all(np.abs(at) < [1.5, 1.0]) and np.ptp(at[:, 0]) > 1.0
     assert near.position[1] > whole.position[1] + 5.0
     np.testing.assert_allclose(seen(8.0)[0].position, whole.position, atol=0.1)

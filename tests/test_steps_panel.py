@@ -206,3 +206,12 @@ def test_stage_bars_are_escaped_and_filled(panel: Panel) -> None:
     evil = (StepHeading('"><img src=x>', "t", "<b>"), StepHeading("b", "t", "<b>"), StepHeading("c", "t", "End"))
     html = stages_html(evil, 0)
     assert "<img" not in html and "<b>" not in html and "width:50.0%" in html and "width:0.0%" in html
+
+
+def test_a_step_to_begin_at_gives_way_to_one_that_is_asked_for(server: viser.ViserServer) -> None:
+    panel = StepsPanel(server.gui, lambda event: None)
+    panel.begin_at("outcome")
+    assert TIMELINE[panel.advance(TIMELINE, True)[0]].key == "outcome"
+    panel.go(TIMELINE[1].key)
+    panel.begin_at("outcome")
+    assert panel.advance(TIMELINE, True)[0] == 1

@@ -172,6 +172,8 @@ class RunDisplay:
         balls = controls.display.wanted_view == "Balls" and at_hand != "Translation"
         if balls and any(step.key == CLIQUE_STEP for step in timeline):
             self.panels.steps.go(CLIQUE_STEP)
+        if self._opens_photographs(run):
+            self.panels.steps.begin_at(timeline[-1].key)
         index, pause = self.panels.steps.advance(timeline, asked)
         picture, last = paint(trace, index, told), index == len(timeline) - 1
         diagnosis = None if hidden else diagnosis
@@ -207,6 +209,14 @@ class RunDisplay:
             self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, not told)
         self._client.flush()
         return self.canvas.check() if pause is None else pause
+
+    def _opens_photographs(self, run: Run) -> bool:
+        """Whether this is the first run on the page of a map of photographs, of which is asked first where they were
+        taken."""
+        label = run.request.scene.scene
+        scene = self._scene_of(label)
+        known = self._shown is not None and self._shown[0].request.scene.scene == label
+        return not known and scene is not None and scene.cloud is not None
 
     def _outcome_of(self, trace: Trace, judged: Judgement | None) -> Table:
         """The table of the outcome, which is the same at all steps."""

@@ -1,8 +1,8 @@
 """``spherloc map``: a folder of photographs, or a video, becomes a map with a report, and scenes that open at once.
 
-A page that makes a map starts ``python -m spherloc_viz.commands.map FOLDER OUTPUT`` and reads lines of JSON: {"kind",
-"done", "count"} as it goes on, and at the end {"scene", "summary"} or {"error"}. A termination signal ends it; what was
-done is kept and not done again.
+A page that makes a map starts ``python -m spherloc_viz.commands.map FOLDER OUTPUT SCALE`` and reads lines of JSON:
+{"kind", "done", "count"} as it goes on, and at the end {"scene", "report", "summary"} or {"error"}. SCALE is as
+``scale_of_words`` takes it. A termination signal ends it; what was done is kept and not done again.
 """
 
 import json
@@ -38,6 +38,8 @@ from spherloc_viz.commands.map_report import MAP_FEATURES, map_report, summary
 from spherloc_viz.commands.progress import progress, say
 
 REPORT = "report.html"
+MAX_METRES = 1e6
+"""Heights and distances are below this."""
 MAX_SIZES = 4
 """Largest number of different sizes of new images that are named."""
 
@@ -189,13 +191,35 @@ def _kind(views: Sequence[View]) -> str:
     return f"panoramas of {size}" if isinstance(camera, Equirectangular) else f"{camera.model} images of {size}"
 
 
-def main(folder: Path, output: Path) -> int:
-    """Make the map of a folder's photographs for a page that started this process; returns the exit code."""
+def scale_of_words(words: str) -> ScaleMeasurement:
+    """The measurement in a line: the height of the cameras in metres, or the names of two images (in quotes, if they
+    have spaces) and their distance; none if it is empty. Raises ``InputError`` for anything else."""
+    try:
+        *images, metres = shlex.split(words) or [""]
+        if not images and not metres:
+            return ScaleMeasurement()
+        value = float(metres)
+        if 0.0 < value < MAX_METRES and len(images) == 0:
+            return ScaleMeasurement(camera_height_m=value)
+        if 0.0 < value < MAX_METRES and len(images) == 2:
+            return ScaleMeasurement(distance=(images[0], images[1], value))
+    except ValueError:
+        pass
+    raise InputError(
+        f"the scale is {show(words)}; give the height of the cameras in metres, such as 1.6, or two photographs and "
+        "their distance, such as 1.jpg 5.jpg 12.5."
+    )
+
+
+def main(folder: Path, output: Path, scale: str = "") -> int:
+    """Make the map of a folder's photographs for a page that started this process, with a scale as ``scale_of_words``
+    takes it; returns the exit code."""
     report = output / REPORT
     with for_a_page():
         try:
             found = photographs(folder, {})
-            made = make_map(found.views, folder, output, ScaleMeasurement(), None, _progress, how=how_of())
+            measured = scale_of_words(scale)
+            made = make_map(found.views, folder, output, measured, None, _progress, how=how_of())
             report.write_text(map_report(made, found), encoding="utf-8")
         except SpherlocError as error:
             _tell({"error": str(error)})
@@ -205,7 +229,7 @@ def main(folder: Path, output: Path) -> int:
             return 1
         others = "other images  open their folder in the list: they can be localized in this map"
         told = [*found.remarks, *summary(made, found), f"report        {report}", others]
-    _tell({"scene": str(made.written.scene), "summary": told})
+    _tell({"scene": str(made.written.scene), "report": str(report), "summary": told})
     return 0
 
 
@@ -220,4 +244,4 @@ def _tell(what: dict[str, Any]) -> None:
 if __name__ == "__main__":
     if hasattr(os, "nice"):
         os.nice(5)  # lower priority than the page that started it
-    sys.exit(main(Path(sys.argv[1]), Path(sys.argv[2])))
+    sys.exit(main(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]))

@@ -357,14 +357,14 @@ def map(
     """
     from spherloc.frontend.masks import Masks
     from spherloc.mapping.make import ScaleMeasurement
-    from spherloc_viz.commands.map import cameras_of_file, make
+    from spherloc_viz.commands.map import MAX_METRES, cameras_of_file, make
 
     if sum(one is not None for one in (camera_height, distance, positions)) > 1:
         raise InputError("--camera-height, --distance and --positions all give the scale; keep one.")
     if panorama and camera is not None:
         raise InputError("--panorama needs no --camera; keep one of them.")
     for flag, metres in (("--camera-height", camera_height), ("--distance", distance and distance[2])):
-        if metres is not None and not 0.0 < metres < 1e6:
+        if metres is not None and not 0.0 < metres < MAX_METRES:
             raise InputError(f"{flag} is {metres:g}; give a positive number of metres.")
     if not 2 <= frames <= 500:
         raise InputError(f"--frames is {frames}; give a number from 2 to 500.")

@@ -230,22 +230,31 @@ def write_photographs(folder: Path) -> None:
 def test_a_folder_of_photographs_becomes_a_map_and_opens(
     images_tab: Playground, images_address: tuple[str, Path]
 ) -> None:
-    """Chosen in an allowed folder; its queries, which are images of the map, stand in the strip with their pictures."""
+    """Chosen in an allowed folder, with a known distance; it opens at the outcome, and its queries, which are images of
+    the map, stand in the strip with their pictures."""
     tab, folder = images_tab, images_address[1].parent / "square"
     write_photographs(folder)
     inliers = tab.value("inliers").inner_text()
     tab.tab("Open")
     tab.touch("open-folder:0:0:").click()
     tab.touch("open-folder:0:0:square").click()
+    names = sorted(path.name for path in folder.iterdir())
+    tab.entry("Scale").fill(f"{names[0]} {names[2]} 11.8")
     stop = tab.page.get_by_role("button", name="Stop the map")
     tab.touch("map-folder:0:square").click()
     expect(tab.page.get_by_text(re.compile(r"^square: \d of \d (images|pairs of images) "))).to_be_visible()
     expect(stop).to_be_visible()
     expect(tab.page.get_by_role("cell", name=re.compile(r"^3 of 3 images, "))).to_be_visible()
     expect(stop).to_have_count(0)
+    expect(tab.page.get_by_role("cell", name=re.compile("are 11.8 m apart$"), exact=True)).to_be_visible()
+    with tab.page.expect_download() as download:
+        tab.page.get_by_role("button", name="Save the report").click()
+    assert download.value.suggested_filename == "square_map.html"
+    assert download.value.path().read_bytes() == (folder.with_name("square_map") / "report.html").read_bytes()
 
     scene = load_scene(folder.with_name("square_map") / "scene.toml")
-    assert isinstance(scene, MapScene)
+    assert isinstance(scene, MapScene) and scene.metric
+    expect(tab.page.locator(".step-title")).to_have_text("Outcome")
     tab.tab("Play")
     expect(tab.widget("Scene")).to_have_value(scene.name)
     expect(tab.value("inliers")).not_to_have_text(inliers)
@@ -255,4 +264,16 @@ def test_a_folder_of_photographs_becomes_a_map_and_opens(
     assert [query.get_attribute("aria-label") for query in queries.all()] == [view.name for view in scene.queries]
     sizes = queries.locator("img").evaluate_all("all => all.map(one => [one.naturalWidth, one.naturalHeight])")
     assert sizes == [[104, 52]] * 3
+
+    tab.settle()
+    opened = tab.viewer
+    tab.press("Above")
+    tab.until(lambda: tab.viewer != opened, "the viewer moves")
+    tab.settle()
+    above, inliers = tab.viewer, tab.value("inliers").inner_text()
+    queries.nth(1).click()
+    expect(tab.widget("Query")).to_have_value(scene.queries[1].name)
+    expect(tab.value("inliers")).not_to_have_text(inliers)
+    tab.settle()
+    assert np.allclose(np.abs(tab.viewer[3:]), np.abs(above[3:]), atol=0.05), "from above too"
     tab.expect_quiet(images_address[0])

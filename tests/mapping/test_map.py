@@ -40,7 +40,7 @@ from spherloc.mapping.photographs import (
 from spherloc.mapping.scene_files import _camera, _queries
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
 from spherloc.problem import Problem
-from spherloc_viz.commands.map import _kind, _sizes, cameras_of_file, how_of, main
+from spherloc_viz.commands.map import _kind, _sizes, cameras_of_file, how_of, main, scale_of_words
 from spherloc_viz.commands.map_report import map_report, summary
 from tests.waiting import LIMIT_S
 
@@ -504,6 +504,17 @@ def test_a_stopped_map_goes_on(tmp_path, rng):
         database.clear_keypoints()
     with pytest.raises(InputError, match="no two of the 2 photographs"):
         make_map(views, tmp_path, tmp_path / "map", ScaleMeasurement(), None, lambda *_: None)
+
+
+def test_a_page_asks_for_the_scale_in_a_line():
+    assert scale_of_words(" ") == ScaleMeasurement()
+    assert scale_of_words("1.6") == ScaleMeasurement(camera_height_m=1.6)
+    assert scale_of_words("'first floor/1.jpg' 5.jpg 12.5") == ScaleMeasurement(
+        distance=("first floor/1.jpg", "5.jpg", 12.5)
+    )
+    for words in ("0", "-1", "nan", "1e7", "1.jpg 2", "1.jpg 2.jpg", "1.jpg 2.jpg 3.jpg 4", "'1.jpg 2"):
+        with pytest.raises(InputError, match="give the height of the cameras in metres, such as 1.6, or two"):
+            scale_of_words(words)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit of the size of files")

@@ -114,6 +114,11 @@ class StepsPanel:
         self._ask_for(key)
         self._changed(None)
 
+    def begin_at(self, key: str) -> None:
+        """Show the step of that key first, unless another one is asked for; on the session's page thread."""
+        with self._lock:
+            self._goal = key if self._goal is None else self._goal
+
     def move(self, button: str) -> None:
         """Press "Previous", "Next" or "Play"; other names are ignored."""
         if button in (PREVIOUS, NEXT, PLAY):

@@ -1,4 +1,4 @@
-"""Makes a map of a folder's photographs in the background, with its progress and a button that stops it."""
+"""Makes a map of a folder's photographs in the background: progress, a button that stops it, and the report."""
 
 import json
 import subprocess
@@ -11,11 +11,18 @@ from typing import Any
 
 import viser
 
+from spherloc.errors import InputError, reason
+from spherloc.files import read_file
 from spherloc_viz.app.text import begun, box, status_html
 
 MODULE = "spherloc_viz.commands.map"
 MAX_LETTERS = 20_000
 """Longest line that is read from the process."""
+SCALE_HINT = (
+    "For a map in metres: the height of the cameras above the ground, such as 1.6, or two photographs and their "
+    "distance, such as 1.jpg 5.jpg 12.5. A map that is there already is only scaled."
+)
+MAX_REPORT_BYTES = 500_000_000
 OUTPUT = "_map"
 """What the folder of a map is called, after that of its photographs; as the command calls it."""
 
@@ -23,16 +30,25 @@ OUTPUT = "_map"
 class MapPanel:
     """One page's; one map at a time. The work is a process of its own, so that the page stays quick."""
 
-    def __init__(self, gui: viser.GuiApi, finished: Callable[[Path], None]) -> None:
+    def __init__(self, client: viser.ClientHandle, finished: Callable[[Path], None]) -> None:
         """``finished`` is called with the scene file of a map that is done, on a thread of this panel."""
-        self._finished = finished
+        gui = client.gui
+        self._client, self._finished = client, finished
+        self._scale = gui.add_text("Scale", "", hint=SCALE_HINT, visible=False)
         self._text = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0, visible=False)
         self._stop = gui.add_button("Stop the map", visible=False)
+        self._save = gui.add_button("Save the report", hint="What became of each photograph, and why.", visible=False)
         self._stop.on_click(lambda event: self.close())
+        self._save.on_click(lambda event: self._save_report())
+        self._report: Path | None = None
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
         self._stopped = False
+
+    def offer(self, photographs: bool) -> None:
+        """Ask for the scale where a folder of ``photographs`` is looked at."""
+        self._scale.visible = photographs
 
     def start(self, folder: Path, output: Path) -> None:
         """Make the map of ``folder`` in ``output``; nothing happens while another one is made."""
@@ -40,12 +56,13 @@ class MapPanel:
             if self._process is not None:
                 return
             self._stopped = False
-            command = [sys.executable, "-m", MODULE, str(folder), str(output)]
+            command = [sys.executable, "-m", MODULE, str(folder), str(output), self._scale.value]
             self._process = process = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
             )
         self._say(f"Making a map of {folder.name} …")
         self._bar.value, self._bar.visible, self._stop.visible = 0.0, True, True
+        self._save.visible = False
         threading.Thread(target=self._follow, args=(process, folder), name="spherloc-map", daemon=True).start()
 
     def close(self) -> None:
@@ -69,12 +86,22 @@ class MapPanel:
         self._bar.visible = self._stop.visible = False
         if "scene" in said:
             self._text.content = box(_table(said["summary"]), "font-size:12px;overflow-wrap:anywhere")
+            self._report, self._save.visible = Path(said["report"]), True
             self._finished(Path(said["scene"]))
         elif stopped:
             self._say("Stopped; what was done is kept for the next time.")
         else:
             sentence = str(said.get("error", "the map could not be made; try the command spherloc map."))
             self._text.content = status_html(begun(sentence), wrong=True)
+
+    def _save_report(self) -> None:
+        """Send the report to the browser, which saves it."""
+        assert self._report is not None
+        try:
+            content = read_file(self._report, MAX_REPORT_BYTES)
+        except OSError as error:
+            raise InputError(f"{self._report}: cannot be read ({reason(error)}); make the map again.") from None
+        self._client.send_file_download(f"{self._report.parent.name}.html", content, save_immediately=True)
 
     def _say(self, words: str) -> None:
         self._text.content = status_html(words)

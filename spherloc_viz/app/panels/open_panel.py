@@ -24,7 +24,8 @@ from spherloc_viz.app.workers import BackgroundWorker
 
 MAP_ABOUT = (
     "Panoramas twice as wide as high, or images with the calibrations of their cameras beside them. It takes some "
-    "minutes, and opens when it is done."
+    "minutes, and opens when it is done. For metres, give as Scale the height of the cameras above the ground (1.6), "
+    "or two photographs and their distance (1.jpg 5.jpg 12.5)."
 )
 MAX_NAMED = 3
 """Largest number of folders, besides the last, that are named."""
@@ -186,7 +187,7 @@ class OpenPanel:
     ) -> None:
         """``roots`` are the folders that may be looked into; ``open_scene`` is called on a thread of this panel, and
         ``at_hand`` gives the file of the scene that the page shows."""
-        self._open_scene, self._at_hand, self._touches = open_scene, at_hand, touches
+        self._open_scene, self._at_hand = open_scene, at_hand
         self._roots, self._recent = Roots(roots), recent or RecentScenes()
         self._scratch = Scratch()
         self._background = BackgroundWorker(f"spherloc-open-{client.client_id}", self._complain)
@@ -195,9 +196,9 @@ class OpenPanel:
         self._files: dict[str, File] = {}
         self._bundled: list[Row] = []
         self._status = gui.add_html("", visible=False)
-        self._map = MapPanel(gui, lambda path: self._background.ask(lambda: self._open_at_outcome(path)))
         with gui.add_folder("Upload matches", expand_by_default=False):
             self._build_form(gui)
+        self._map = MapPanel(client, lambda path: self._background.ask(lambda: self._open_file(path)))
         self._list = gui.add_html("")
         # Larger files are turned away before they fill this process's memory.
         limit_uploads(client, MAX_BYTES, self._complain)
@@ -282,13 +283,8 @@ class OpenPanel:
             raise InputError("the map that is shown is not in an allowed folder; open a map from the list first.")
         self._say("Looking at the photographs …")
         path, remarks = add_new_images(scene, folder)
-        self._open_at_outcome(path)
-        self._say(" ".join(remarks))
-
-    def _open_at_outcome(self, path: Path) -> None:
-        """Open a scene of photographs: where they were taken is what is to be seen first."""
         self._open_file(path)
-        self._touches.deliver(Touch("step", "outcome", 0.0, 0.0, 0.0, 0.0, False))
+        self._say(" ".join(remarks))
 
     def _map_for(self, listing: Listing) -> str:
         """The name of the map at hand, if other photographs than its own are listed; else empty."""
@@ -329,8 +325,10 @@ class OpenPanel:
             with self._lock:
                 self._at = None
             self._list.content = self._list_html(None)
+            self._map.offer(False)
             raise
         html = self._list_html(listing)
+        self._map.offer(listing is not None and bool(_map_title(listing)))
         update_widget(self._list, content=html)
 
     def _list_html(self, listing: Listing | None) -> str:

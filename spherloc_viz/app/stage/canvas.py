@@ -24,6 +24,8 @@ FIRST_CHECKS, MAX_CHECKS, CHECK_S = 8, 40, 0.4
 drops its first view and reports that its viewer has not moved; a slow page does so for many checks."""
 MAX_PX = 1 << 20
 """Largest width and height of a window that are accepted from a page."""
+SPHERE = "Sphere"
+"""Name of the view of the sphere, which shows it in any case."""
 HELD = "held"
 """Used in place of a view's name for a view that a link asked for."""
 MOVE_S = 1.0
@@ -149,6 +151,8 @@ class Canvas:
         if picture is None:
             return
         in_the_way = views.before_the_eyes(picture, position) | self._cut(picture, position)
+        if self._looked is None or self._looked[0] != SPHERE:
+            in_the_way |= views.over_the_walk(picture, position)
         in_camera = views.inside(picture, position)
         # Does not wait, since the viewer moves often, for a picture that is being drawn.
         if in_the_way != self._painter.hidden or self._painter.resizes(position, in_camera):
@@ -198,6 +202,7 @@ class Canvas:
             self._held = None
         self._held_step_came = self._held is not None and (self._held_step_came or at_held)
         other_step, elsewhere = step != self._step, self._scene not in (None, scene)
+        other_query = other_step and self._step is not None and self._step[1] == step[1]
         self._step, self._scene = step, scene
         if wanted is not None:
             self._look(wanted, picture)
@@ -206,6 +211,8 @@ class Canvas:
         elif elsewhere or views.stands_at(self._client, views.START):
             self._look(None, picture)
         elif walls_came and self._looked is not None and self._untouched():
+            self._look(self._looked[0], picture)
+        elif other_query and self._looked is not None and self._looked[0] in views.NAMES and self._untouched():
             self._look(self._looked[0], picture)
         elif self._display.follow and (other_step or self._untouched()):
             self._follow_step(picture, other_step)

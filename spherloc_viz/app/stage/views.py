@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from spherloc.geometry import yaw_rotation
 from spherloc.types import FloatArray
 from spherloc_viz.app.web.viser_internals import place_viewer
+from spherloc_viz.layers import LAST
 from spherloc_viz.layers.frame import RING_ROOM, SPHERE_ROOM, circle, dense_points, sphere_box
 from spherloc_viz.layers.point_cloud import REFERENCES
 from spherloc_viz.layers.primitives import Label, Mesh, Picture, Points, SceneItem, Segments, Textured
@@ -105,6 +106,8 @@ TURNING = 0.02
 """Distance, in sphere radii, from a viewer inside the camera to the point around which the mouse turns the view."""
 CLOSE = 0.15
 """Distance from a camera's centre, in sphere radii, within which the viewer counts as inside the camera."""
+OUTSIDE = 1.2
+"""Distance from the sphere's centre, in sphere radii, from which on the viewer counts as outside of it."""
 TURNS_RAD = np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])
 """Rotations of a view about the vertical that are tried, the smallest first."""
 YAW_TURNS = np.array([yaw_rotation(turn).T for turn in TURNS_RAD])
@@ -161,10 +164,8 @@ def look(client: viser.ClientHandle, view: Viewpoint) -> None:
 def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: float = 0.0) -> Viewpoint:
     """The view of the step's subject, on a canvas with that aspect ratio, between ``walls``. If ``letter``, the width
     of a letter as a share of half the canvas' height, is not 0, the labels beside the subject are in view too."""
-    focus = picture.focus
-    route = [item.positions for item in picture.scene if isinstance(item, Points) and item.layer == "trajectory"]
-    subject = np.vstack([focus.points, *route]) if focus.view == "Overview" else focus.points
-    view = _clear(focus.view, picture, subject, subject if focus.clear is None else focus.clear, aspect, walls)
+    subject, clear = _followed(picture)
+    view = _clear(picture.focus.view, picture, subject, clear, aspect, walls)
     names = _names(picture, subject) if letter else []
     if not names:
         return view
@@ -172,6 +173,17 @@ def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: 
     insets = np.vstack([np.zeros((len(subject), 2)), _half_sizes(names, letter)])
     positions, targets = _fits(held, (view.position - view.target)[None], aspect, insets)
     return Viewpoint(positions[0], targets[0])
+
+
+def _followed(picture: Picture) -> tuple[FloatArray, FloatArray]:
+    """Points (K, 3) that the view of a step must hold, and those (L, 3) that are not to be hidden."""
+    focus = picture.focus
+    walk = _walk_at_end(picture)
+    if walk is not None:
+        return walk, walk
+    route = [item.positions for item in picture.scene if isinstance(item, Points) and item.layer == "trajectory"]
+    subject = np.vstack([focus.points, *route]) if focus.view == "Overview" else focus.points
+    return subject, subject if focus.clear is None else focus.clear
 
 
 def cut(picture: Picture, view: Viewpoint, aspect: float, letter: float) -> frozenset[str]:
@@ -221,7 +233,7 @@ def shows(view: Viewpoint, subject: FloatArray, aspect: float) -> bool:
 def fits(name: str | None, view: Viewpoint, picture: Picture, aspect: float) -> bool:
     """Whether a view of that name, or the step's view for None, still shows its subject."""
     if name is None:
-        return shows(view, picture.focus.points, aspect)
+        return shows(view, _followed(picture)[0], aspect)
     return same(view, _inside(picture)) if name == INSIDE else shows(view, _subject(name, picture), aspect)
 
 
@@ -250,6 +262,18 @@ def before_the_eyes(picture: Picture, position: FloatArray) -> frozenset[str]:
     if inside(picture, position):
         names |= {item.name for item in picture.scene if isinstance(item, Label)}
     return frozenset(names)
+
+
+def over_the_walk(picture: Picture, position: FloatArray) -> frozenset[str]:
+    """Names of the nodes of the sphere, if it would cover where photographs were taken at the outcome, for a viewer at
+    that position (3,) outside of it."""
+    surface = _surface(picture)
+    if surface is None or _walk_at_end(picture) is None:
+        return frozenset()
+    centre, radius_m = _centre_and_radius(surface)
+    if np.linalg.norm(position - centre) < OUTSIDE * radius_m:
+        return frozenset()
+    return frozenset(item.name for item in picture.scene if item.layer in ("sphere", "image"))
 
 
 def inside(picture: Picture, position: FloatArray) -> bool:
@@ -418,8 +442,38 @@ def _in_the_way(standing: FloatArray, targets: FloatArray, positions: FloatArray
 
 
 SMALL_WALK, WALK_ROOM = 1.0 / 3.0, 0.4
-"""If photographs were taken in a part of the map that is smaller than this share of it, the view from above shows that
-part, with room around it, as a share of its size."""
+"""If photographs were taken in a part of the map that is smaller than this share of it, the view from above and that of
+the outcome show that part, with room around it, as a share of its size."""
+
+
+def _walk(picture: Picture) -> FloatArray | None:
+    """Points (K, 3) around where the photographs of a map and the query were taken, if that is a small part of the map;
+    None without it or without a position of the query."""
+    items = {item.name: item for item in picture.scene}
+    points, camera = items["map/points"], items.get("cameras/estimate")
+    assert isinstance(points, Points)
+    route = _route(picture)
+    if not route or not isinstance(camera, Segments):  # without a position, the sphere is elsewhere
+        return None
+    taken = np.vstack([*route, camera.points[:1, 0]])
+    extent_m, whole_m = (float(np.ptp(places, axis=0).max()) for places in (taken, dense_points(points.positions)))
+    if not 0.0 < extent_m < SMALL_WALK * whole_m:
+        return None
+    return np.vstack([taken - WALK_ROOM * extent_m, taken + WALK_ROOM * extent_m])
+
+
+def _walk_at_end(picture: Picture) -> FloatArray | None:
+    """``_walk`` at the last step."""
+    return _walk(picture) if picture.step.stage == LAST else None
+
+
+def _route(picture: Picture) -> list[FloatArray]:
+    """Where the queries of a sequence and the references were taken: arrays (K, 3)."""
+    return [
+        item.positions
+        for item in picture.scene
+        if isinstance(item, Points) and (item.layer == "trajectory" or item.name == REFERENCES)
+    ]
 
 
 def _subject(name: str, picture: Picture) -> FloatArray:
@@ -436,19 +490,10 @@ def _subject(name: str, picture: Picture) -> FloatArray:
         for item in picture.scene
         if isinstance(item, Segments) and item.layer in ("cameras", "scale bar")
     ]
-    route = [
-        item.positions
-        for item in picture.scene
-        if isinstance(item, Points) and (item.layer == "trajectory" or item.name == REFERENCES)
-    ]
-    dense = dense_points(points.positions)
-    camera = items.get("cameras/estimate")
-    if name == "Above" and route and isinstance(camera, Segments):  # without a position, the sphere is elsewhere
-        taken = np.vstack([*route, camera.points[:1, 0]])
-        extent_m = float(np.ptp(taken, axis=0).max())
-        if 0.0 < extent_m < SMALL_WALK * float(np.ptp(dense, axis=0).max()):
-            return np.vstack([taken - WALK_ROOM * extent_m, taken + WALK_ROOM * extent_m])
-    return np.vstack([dense, surface.vertices, *lines, *route])
+    walk = _walk(picture) if name == "Above" else None
+    if walk is not None:
+        return walk
+    return np.vstack([dense_points(points.positions), surface.vertices, *lines, *_route(picture)])
 
 
 def _sphere(surface: object, ring: bool) -> FloatArray:
