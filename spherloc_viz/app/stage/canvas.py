@@ -203,6 +203,7 @@ class Canvas:
         self._held_step_came = self._held is not None and (self._held_step_came or at_held)
         other_step, elsewhere = step != self._step, self._scene not in (None, scene)
         other_query = other_step and self._step is not None and self._step[1] == step[1]
+        same_name = other_query and self._looked is not None and self._looked[0] in views.NAMES
         self._step, self._scene = step, scene
         if wanted is not None:
             self._look(wanted, picture)
@@ -210,9 +211,7 @@ class Canvas:
             self._look_again(self._held[1])
         elif elsewhere or views.stands_at(self._client, views.START):
             self._look(None, picture)
-        elif walls_came and self._looked is not None and self._untouched():
-            self._look(self._looked[0], picture)
-        elif other_query and self._looked is not None and self._looked[0] in views.NAMES and self._untouched():
+        elif self._looked is not None and (walls_came or same_name) and self._untouched():
             self._look(self._looked[0], picture)
         elif self._display.follow and (other_step or self._untouched()):
             self._follow_step(picture, other_step)
