@@ -238,6 +238,17 @@ def test_the_certificate_is_in_the_outcome(exact: Trace, certificate: Certificat
     assert "certificate" not in dict(outcome_table(replace(exact, certificate=None)).rows)
 
 
+def test_a_wrong_pose_that_is_believed_says_that_nothing_tells_it(mc: Trace) -> None:
+    """Of two lines, "failure" and "localized", one is by the truth."""
+    assert mc.cam_from_map is not None
+    far = mc.cam_from_map + np.array([0.0, 0.0, 0.0, 5.0])
+    wrong = replace(mc, problem=replace(mc.problem, truth_cam_from_map=far))
+    told, believed = dict(outcome_table(wrong).rows), dict(outcome_table(mc).rows)
+    assert (told["outcome"], believed["outcome"]) == ("failure", "success")
+    assert told["judged without the truth"] == "localized: nothing in the matches tells that the pose is wrong"
+    assert believed["judged without the truth"] == "localized"
+
+
 @pytest.mark.parametrize(
     ("more", "bounds", "proof", "why"),
     [

@@ -287,7 +287,8 @@ def _text(results: SequenceResults, summary: Summary) -> str:
     if first:
         lines.append(f"  {first} initialised by {setting.options['initialise']}, the others tracked")
     lines += [f"  {line}" for line in _wrong(results)]
-    lines += [f"  success {_rate(rate, setting.unit)}" for rate in (*summary.success, *summary.registration_success)]
+    rates = (*summary.success, *summary.registration_success)
+    lines += [f"  success {_rate(rate, setting.unit)}" for rate in rates if rate.judged or not summary.without_truth]
     if summary.median_rotation_error_deg is not None and summary.median_translation_error_m is not None:
         lines.append(
             f"  median error {summary.median_rotation_error_deg:.3f} deg and "
@@ -397,7 +398,12 @@ def _skipped(summary: Summary) -> Iterator[str]:
     if summary.unreadable:
         yield f"not judged: {summary.unreadable} with an unreadable image"
     if summary.without_truth:
-        yield f"not judged by the truth: {summary.without_truth} whose true pose is unknown"
+        none = not any(rate.judged for rate in summary.success)
+        yield (
+            "errors are unknown: these queries have no true poses"
+            if none
+            else f"not judged by the truth: {summary.without_truth} whose true pose is unknown"
+        )
     if summary.not_registered:
         yield f"not judged by registration: {summary.not_registered} that could not be registered"
 

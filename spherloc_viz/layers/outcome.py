@@ -4,7 +4,7 @@ import numpy as np
 
 from spherloc.geometry import camera_centre
 from spherloc.metrics import SUCCESS_M, evaluate
-from spherloc.outcome import Judgement, count_within_noise, judge
+from spherloc.outcome import Judgement, Outcome, count_within_noise, judge
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
@@ -142,7 +142,7 @@ def early_table(trace: Trace, judged: Judgement | None) -> Table:
     metrics = evaluate(trace)
     rows: list[tuple[str, str]] = [("estimator", trace.estimator), ("outcome", verdict(trace, metrics.success))]
     if trace.cam_from_map is not None:
-        rows.append(("judged without the truth", "…" if judged is None else _judged(judged)))
+        rows.append(("judged without the truth", "…" if judged is None else _judged(judged, metrics.success)))
         rows.append(("camera position", place_text(camera_centre(trace.cam_from_map), 3, trace.problem.metric)))
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         rows.append(("rotation error", f"{metrics.rotation_error_deg:.3f}°"))
@@ -163,7 +163,9 @@ def early_table(trace: Trace, judged: Judgement | None) -> Table:
     return Table("outcome", ("", "this run"), tuple(rows))
 
 
-def _judged(judged: Judgement) -> str:
+def _judged(judged: Judgement, success: bool | None) -> str:
+    if judged.outcome is Outcome.LOCALIZED and success is False:
+        return f"{judged.outcome}: nothing in the matches tells that the pose is wrong"
     return " ".join((f"{judged.outcome}{':' * bool(judged.reasons)}", *judged.reasons))
 
 

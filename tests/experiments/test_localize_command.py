@@ -250,7 +250,7 @@ def near(image: np.ndarray, color: tuple[int, int, int]) -> int:
 
 
 @pytest.mark.usefixtures("drawn")
-def test_the_picture_shows_truth_errors_and_failures(tmp_path: Path) -> None:
+def test_the_picture_shows_truth_errors_and_failures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from spherloc_viz.style import OUTLIER, TRUTH
 
     good = write_scene(tmp_path, queries=4, timed=True)
@@ -273,7 +273,10 @@ def test_the_picture_shows_truth_errors_and_failures(tmp_path: Path) -> None:
     (tmp_path / "blind").mkdir()
     blind = write_scene(tmp_path / "blind", queries=3, unknown=[0, 1, 2], few=[1])
     blind.write_text(blind.read_text().replace("drawn walk", r"cost $\\frac$ 5 \u8857"))
+    capsys.readouterr()
     assert run(blind, tmp_path / "blind" / "out") == 1
+    said = capsys.readouterr().out
+    assert "errors are unknown: these queries have no true poses" in said and "nothing to judge" not in said
     assert near(pixels_of((tmp_path / "blind" / "out" / "trajectory.png").read_bytes()), TRUTH) == 0
     assert not (tmp_path / "blind" / "out" / "truth.tum").exists()
     told = read_results(tmp_path / "blind" / "out")
