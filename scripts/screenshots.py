@@ -153,7 +153,7 @@ def gallery(page: Page) -> None:
 
 
 SYNTHETIC_VIEWS: Views = {
-    "outcome": lambda page: tab(page, "Yaw"),
+    "opening": lambda page: tab(page, "Yaw"),
     "arcs": lambda page: step(page, "The yaw most arcs share"),
     "roots": lambda page: step(page, "roots"),
     "charts": lambda page: (step(page, "The yaw most arcs share"), tab(page, "Charts")),

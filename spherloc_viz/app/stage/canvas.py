@@ -28,8 +28,8 @@ SPHERE = "Sphere"
 """Name of the view of the sphere, which shows it in any case."""
 HELD = "held"
 """Used in place of a view's name for a view that a link asked for."""
-MOVE_S = 1.0
-"""Upper limit of the time in which the page moves its viewer smoothly (``smooth.js``)."""
+MOVE_S = 5.0
+"""Upper limit of the time in which a slow page moves its viewer smoothly (``smooth.js``), while its panels dock."""
 RESHAPED = 0.02
 """Relative change of the canvas' aspect ratio, or of the width of its letters, from which on a view is fitted again."""
 
@@ -63,7 +63,9 @@ class Canvas:
         """The last view that was set: its name, or None for that of the step; the view; the canvas' aspect ratio; and
         the width of a letter in it."""
         self._taken_s = -math.inf
-        """When that view was set, seconds of a monotonic clock."""
+        """When that view was set, seconds of a monotonic clock, ..."""
+        self._arrived = True
+        """... and whether the viewer has been there since."""
         self._held: tuple[str, views.Viewpoint] | None = None
         """The key of a step, and the view that a link asked for at that step."""
         self._held_step_came = False
@@ -251,14 +253,18 @@ class Canvas:
         if name is None:
             self._followed = view
         self._looked, self._taken_s = (name, view, aspect, self._letter()), time.monotonic()
+        self._arrived = False
         picture = self._picture
         self._painter.see_from(view.position, picture is not None and views.inside(picture, view.position))
         views.look(self._client, view)
 
     def _untouched(self) -> bool:
         """Whether the viewer is still where it was put, or on the way there."""
-        moving = time.monotonic() - self._taken_s < MOVE_S
-        return self._looked is not None and (moving or views.stands_at(self._client, self._looked[1]))
+        if self._looked is None:
+            return False
+        there = views.stands_at(self._client, self._looked[1])
+        self._arrived = self._arrived or there
+        return there or (not self._arrived and time.monotonic() - self._taken_s < MOVE_S)
 
     def _follow_page(self) -> None:
         """Called on viser's threads when the page's viewer has moved or its canvas has another shape."""
@@ -266,10 +272,11 @@ class Canvas:
         looked, picture = self._looked, self._picture
         if looked is None or picture is None:
             return
+        untouched = self._untouched()
         if views.stands_at(self._client, views.START):  # a page that was still being built has dropped the view
             with self._lock:
                 self._take(*looked[:3])
-        elif looked[0] != HELD and self._is_reshaped(*looked[2:]) and self._untouched():
+        elif looked[0] != HELD and self._is_reshaped(*looked[2:]) and untouched:
             with self._lock:
                 self._look(looked[0], picture)
 
