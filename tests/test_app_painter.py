@@ -219,10 +219,10 @@ def test_a_dot_before_the_viewer_is_small_on_the_screen(painter: Painter, canvas
     painter.draw(items, ALL)
     assert np.allclose(canvas.nodes["/dot"].batched_scales, [2.0 * LARGEST_DOT, 0.1])
     assert np.allclose(canvas.nodes["/rim"].batched_scales, [2.0 * LARGEST_DOT * HALO, 0.1]), "still around its dot"
-    assert painter.resizes(np.zeros(3), in_camera=True)
+    assert painter.follows(np.zeros(3), in_camera=True)
     painter.see_from(np.zeros(3), in_camera=True)
     assert np.allclose(canvas.nodes["/dot"].batched_scales, [2.0 * LARGEST_DOT_INSIDE, 0.1])
-    assert not painter.resizes(0.02 * near, in_camera=True), "a small step changes nothing"
+    assert not painter.follows(0.02 * near, in_camera=True), "a small step changes nothing"
     moved = Points("dot", "map", np.stack([far, near]), colors, 0.1)
     painter.draw([moved], ALL)
     assert np.allclose(canvas.nodes["/dot"].batched_scales, [0.1, 2.0 * LARGEST_DOT_INSIDE]), "the dots moved"
@@ -268,6 +268,24 @@ def test_a_picture_is_made_once_and_moves_with_its_mesh(painter: Painter, canvas
     np.testing.assert_allclose(node.wxyz, [np.cos(0.35), 0.0, np.sin(0.35), 0.0], atol=1e-9)
     painter.draw([picture(2, turn, made)], ALL - {"image"})
     assert not canvas.shown and made == [1, 2]
+
+
+def test_the_mesh_of_the_map_is_not_before_the_photograph(painter: Painter, canvas: Canvas) -> None:
+    """Where the camera's position is not known yet, a tree may stand within the sphere around it."""
+    glb = trimesh.creation.box().export(file_type="glb")
+    painter.draw([picture(1, np.eye(3))], ALL)
+    painter.draw_backdrop(glb, np.eye(3), visible=True)
+    assert "/backdrop" in canvas.shown
+    painter.see_from(np.zeros(3), in_camera=True)
+    assert "/backdrop" not in canvas.shown
+    painter.draw_backdrop(glb, np.eye(3), visible=True)
+    assert "/backdrop" not in canvas.shown, "however often it is drawn"
+    assert painter.follows(np.ones(3), in_camera=False)
+    painter.see_from(np.ones(3), in_camera=False)
+    assert "/backdrop" in canvas.shown
+    painter.draw([picture(1, np.eye(3))], ALL - {"image"})
+    painter.see_from(np.zeros(3), in_camera=True)
+    assert "/backdrop" in canvas.shown, "without the photograph it is what there is to see"
 
 
 def test_a_picture_that_is_missing_is_not_drawn(painter: Painter, canvas: Canvas) -> None:

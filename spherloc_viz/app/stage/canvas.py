@@ -157,7 +157,7 @@ class Canvas:
             in_the_way |= views.over_the_walk(picture, position)
         in_camera = views.inside(picture, position)
         # Does not wait, since the viewer moves often, for a picture that is being drawn.
-        if in_the_way != self._painter.hidden or self._painter.resizes(position, in_camera):
+        if in_the_way != self._painter.hidden or self._painter.follows(position, in_camera):
             with self._lock:
                 self._painter.hide(in_the_way)
                 self._painter.see_from(position, in_camera)

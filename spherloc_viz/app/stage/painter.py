@@ -100,6 +100,8 @@ RESIZED = 0.2
 """Relative change of a dot's radius from which on it is drawn anew."""
 LABEL_SCALE = 0.9
 """Size of labels, relative to viser's own."""
+PHOTOGRAPH = "sphere/image"
+"""Name of the node of the photograph around the camera."""
 PLACE = frozenset({"wxyz", "position"})
 """Settings of a node that are not properties of the shape drawn there."""
 
@@ -133,6 +135,7 @@ class Painter:
         self.clicked_x = 0.5
         """Horizontal position of the last click, as a share of the canvas' width."""
         self._backdrop: tuple[bytes, Any] | None = None
+        self._backdrop_wanted = False
         if on_pick is not None:
             scene, extend = client.scene, partial(self._clicked, on_pick, True)
             scene.on_click()(partial(self._clicked, on_pick, False))
@@ -177,15 +180,19 @@ class Painter:
             with self._client.atomic():
                 self._follow()
 
-    def resizes(self, eye: np.ndarray, in_camera: bool) -> bool:
-        """Whether ``see_from`` would change the size of a dot; needs no lock."""
-        return any(_resized(handle, item, (eye, in_camera)) for handle, item in self._dots)
+    def follows(self, eye: np.ndarray, in_camera: bool) -> bool:
+        """Whether ``see_from`` would change anything; needs no lock."""
+        before = self._seen_from
+        moved = before is not None and before[1] != in_camera
+        return moved or any(_resized(handle, item, (eye, in_camera)) for handle, item in self._dots)
 
     def see_from(self, eye: np.ndarray, in_camera: bool) -> None:
-        """Limit the size of dots on the screen for a viewer at ``eye`` (3,), who may be inside a camera."""
+        """Limit the size of dots on the screen for a viewer at ``eye`` (3,), who may be inside a camera: then the map's
+        mesh is not shown before the photograph."""
         self._seen_from = eye, in_camera
         with self._client.atomic():
             self._limit_dots()
+            self._show_backdrop()
 
     def _limit_dots(self) -> None:
         for handle, item in self._dots:
@@ -212,9 +219,15 @@ class Painter:
         if self._backdrop is None:
             handle = self._client.scene.add_glb("/backdrop", glb, cast_shadow=False, receive_shadow=False)
             self._backdrop = (glb, handle)
-        handle = self._backdrop[1]
-        handle.wxyz = vtf.SO3.from_matrix(aligned_from_map).wxyz
-        handle.visible = visible
+        self._backdrop[1].wxyz = vtf.SO3.from_matrix(aligned_from_map).wxyz
+        self._backdrop_wanted = visible
+        self._show_backdrop()
+
+    def _show_backdrop(self) -> None:
+        """Show the map's mesh if it is wanted, but not before the photograph around a viewer in the camera."""
+        if self._backdrop is not None:
+            in_camera = self._seen_from is not None and self._seen_from[1]
+            self._backdrop[1].visible = self._backdrop_wanted and not (in_camera and PHOTOGRAPH in self._names)
 
     def _put(self, item: SceneItem, look: tuple) -> None:
         handle, known, last = self._drawn.get(item.name, (None, None, None))
