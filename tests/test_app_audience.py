@@ -25,6 +25,7 @@ MAY_PRESS = {
     "step",
     "move",
     "projector",
+    "window",
     "reveal",
     "views",
     "yaw-zoom",

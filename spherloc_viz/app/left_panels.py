@@ -20,7 +20,7 @@ from spherloc_viz.app.plots.graph_view import GraphView
 from spherloc_viz.app.plots.residual_view import ResidualView
 from spherloc_viz.app.plots.yaw_view import YawView
 from spherloc_viz.app.text import legend_html, opening_card_html, opening_html, summary_html, table_html
-from spherloc_viz.app.web.touch import READY, Touch, Touches, seen_views
+from spherloc_viz.app.web.touch import READY, Touch, Touches, pixels_of, seen_views
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers import graph_begins, steps
 from spherloc_viz.layers.primitives import Picture, Table
@@ -76,7 +76,7 @@ class LeftPanels:
         with _view(gui, views, "Matches"):
             gui.add_html(heading_html("Press a row: the match lights up everywhere", "match"))
             self.matches = MatchTablePanel(gui, touches, changed)
-        self._panel, self._width_px = steps, width_px
+        self._panel, self._width_px, self._projected_px = steps, width_px, 0
         steps.dock_left()
         views.dock_below(steps)
         steps.set_width(width_px)
@@ -164,8 +164,13 @@ class LeftPanels:
 
     def _widen(self, touch: Touch) -> None:
         """Make room for the projector view on a window of so many pixels; 0 ends it."""
-        window_px = int(touch.argument) if touch.argument.isdecimal() and len(touch.argument) < 6 else 0
-        self._panel.set_width(max(self._width_px, int(PROJECTOR_SHARE * window_px)))
+        self._projected_px = int(PROJECTOR_SHARE * pixels_of(touch))
+        self._panel.set_width(max(self._width_px, self._projected_px))
+
+    def fit(self, width_px: int) -> None:
+        """Be as wide as the window now asks for; the projector view may keep them wider."""
+        self._width_px = width_px
+        self._panel.set_width(max(width_px, self._projected_px))
 
     def ready(self) -> None:
         """Tell the page that presses are handled from now on; in a panel that stays when the other one is folded."""

@@ -21,9 +21,9 @@ from spherloc_viz.app.left_panels import LeftPanels
 from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.plots.graph_view import CLIQUE_STEP
-from spherloc_viz.app.stage.canvas import Canvas, text_scale
+from spherloc_viz.app.stage.canvas import Canvas, panel_widths_px, text_scale
 from spherloc_viz.app.text import diagnosis_html, hidden_html, key_step_html, status_html, summary_of
-from spherloc_viz.app.web.touch import Touch, Touches
+from spherloc_viz.app.web.touch import Touch, Touches, pixels_of
 from spherloc_viz.app.web.viser_internals import changes_of, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.layers.key_step import key_step
@@ -93,6 +93,7 @@ class RunDisplay:
         self.card = MatchCard(client.gui, movable, text_scale(client.camera.image_width))
         moved = places.move or (lambda place: None)
         self.canvas = Canvas(client, self.controls.display, select, moved, sum(widths_px))
+        self._widths_px = widths_px
         self._shown: tuple[Run, bytes | None, Picture] | None = None
         self._map: tuple[str, MapScene, bytes | None] | None = None
         """The scene that is being opened: label, scene and mesh."""
@@ -108,6 +109,7 @@ class RunDisplay:
         self._redraw = places.redraw
         touches.on("reveal", self._reveal)
         touches.on("projector", self._project)
+        touches.on("window", self._fit_window)
 
     def withheld(self, run: Run) -> frozenset[str]:
         """Which of ``ANSWERS`` this page hides of a run."""
@@ -129,6 +131,17 @@ class RunDisplay:
     def _project(self, touch: Touch) -> None:
         """Begin the projector view, whose panel the page has widened; 0 ends it."""
         self.canvas.enlarge_labels(1.0 if touch.argument == "0" else PROJECTED)
+
+    def _fit_window(self, touch: Touch) -> None:
+        """The window has another width, as after zooming or on another screen: fit the panels and the text to it."""
+        window_px = pixels_of(touch)
+        widths_px, scale = panel_widths_px(window_px), text_scale(window_px)
+        if window_px and widths_px != self._widths_px:
+            self._widths_px = widths_px
+            self.panels.fit(widths_px[0])
+            self._client.gui.main_panel.set_width(widths_px[1])
+            self.card.fit(scale)
+            self.canvas.fit_text(scale)
 
     def open_map(self, label: str, scene: MapScene, mesh: bytes | None) -> None:
         """Until a run of this scene is drawn, show its map in place of the run at hand."""

@@ -105,6 +105,11 @@ def test_a_sharp_screen_and_a_zoomed_window_have_room_for_the_canvas(browser: Br
     expect(tab.page.get_by_role("tab", name="Play", exact=True)).to_have_count(0)
     room = "() => document.querySelector('canvas').clientWidth"
     tab.until(lambda: tab.page.evaluate(room) > 450, "the canvas has the room of the settings")
+    for size, panel_px, settings in (((2600, 1000), 654, 1), ((911, 512), 344, 0)):
+        tab.page.set_viewport_size({"width": size[0], "height": size[1]})
+        tab.until(lambda px=panel_px: abs(tab.page.evaluate(WIDTH_PX) - px) < 8, "the panels follow the window")
+        expect(tab.page.get_by_role("tab", name="Play", exact=True)).to_have_count(settings)
+    tab.until(lambda: tab.page.evaluate(room) > 450, "the settings are folded again")
     tab.page.keyboard.press("n")
     expect(tab.page).to_have_url(re.compile("step=(?!bearings)"))  # told though the settings are folded
     tab.page.keyboard.press("b")

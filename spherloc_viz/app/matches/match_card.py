@@ -83,9 +83,17 @@ class MatchCard:
             self._more = gui.add_folder("Numbers and pairs", expand_by_default=False)
             with self._more:
                 self._details = gui.add_html("")
-        self._panel.float(x=MARGIN_PX, y=MARGIN_PX, width=self._width_px)
         self._drawn: tuple | None = None
         self._right = False
+        self._place()
+
+    def fit(self, text_scale: float) -> None:
+        """Be as wide as text of another size needs it."""
+        self._width_px = WIDTH_PX * text_scale
+        self._place()
+
+    def _place(self) -> None:
+        self._panel.float(x=-MARGIN_PX if self._right else MARGIN_PX, y=MARGIN_PX, width=self._width_px)
 
     def draw(
         self,
@@ -119,7 +127,7 @@ class MatchCard:
             return
         if right != self._right:
             self._right = right
-            self._panel.float(x=-MARGIN_PX if right else MARGIN_PX, y=MARGIN_PX, width=self._width_px)
+            self._place()
         self._drawn = drawn
         if hidden:
             html, details = untold_html(trace, selected, kept, self._editable), ""

@@ -51,7 +51,8 @@ class Canvas:
         """
         client.scene.set_up_direction("-y")
         self._client, self._display = client, display
-        self._usual_scale = self._label_scale = LABEL_SCALE * text_scale(client.camera.image_width)
+        self._text_scale, self._enlarged = text_scale(client.camera.image_width), 1.0
+        self._label_scale = LABEL_SCALE * self._text_scale
         self._painter = Painter(client, picked, self._label_scale)
         self._camera = TrueCamera(client, moved)
         self._full_width = client.camera.image_width
@@ -119,8 +120,17 @@ class Canvas:
 
     def enlarge_labels(self, factor: float) -> None:
         """Draw labels so many times as large as usual, and fit the view to them."""
+        self._enlarged = factor
+        self._scale_labels()
+
+    def fit_text(self, scale: float) -> None:
+        """Draw labels for text of another size (``text_scale``), and fit the view to them."""
+        self._text_scale = scale
+        self._scale_labels()
+
+    def _scale_labels(self) -> None:
         with self._lock:
-            self._label_scale = factor * self._usual_scale
+            self._label_scale = LABEL_SCALE * self._text_scale * self._enlarged
             self._painter.scale_labels(self._label_scale)
         self._follow_page()
 
@@ -311,6 +321,7 @@ WINDOWS_PX: tuple[tuple[int, tuple[int, int], float], ...] = (
     (2500, (650, 585), 1.5),
     (1800, (500, 450), 1.15),
     (1600, (480, 400), 1.0),
-    (0, (380, 340), 1.0),
+    (1000, (380, 340), 1.0),
+    (0, (340, 340), 1.0),
 )
 """By the least width of the window, px: widths of the panels left and right, px, and the factor of the text size."""

@@ -3,20 +3,29 @@
 // and Next, and with it what is said of a match that was tapped and, at the last step, of a failure. The projector view,
 // key L or an element of the class "projector-toggle", folds the panel on the right and has the view that goes with the
 // step and, in large type, what the step says and at the last one what is said of a failure on the left, for which it
-// asks the server for room (projector:WIDTH of the window). At either end of the steps the button that leads on is disabled, in the panel too.
+// asks the server for room (projector:WIDTH of the window). The server is told too how wide the window is (window:WIDTH).
+// At either end of the steps the button that leads on is disabled, in the panel too.
 (() => {
   const EVERY_MS = 150, FOLDED_MS = 2000, NARROW_PX = 600, ROOMY_PX = 1000, FOLD = "Collapse panel area", UNFOLD = "Expand column";
   const DESELECT = '<button class="deselect" data-touch="deselect:">Deselect</button>';
-  let bar = null, words = null, projector = false, folded = false, roomMade = false, toldWidth = 0, toggledAt = -Infinity;
+  let bar = null, words = null, projector = false, folded = false, roomMade = false, foldedHere = false;
+  let toldWidth = 0, toldWindow = 0, toggledAt = -Infinity;
 
   // While the settings are unfolded on a narrow screen, they take it all.
   const small = () => innerWidth < NARROW_PX;
   const unfolded = () => [...document.querySelectorAll("[data-ready]")].some((one) => one.getClientRects().length > 0);
   const narrow = () => small() && folded && !unfolded();
   const tell = (detail) => dispatchEvent(new CustomEvent("spherloc-touch", { detail }));
-  const rightmost = (label) =>
-    [...document.querySelectorAll(`[aria-label="${label}"]`)]
-      .filter((one) => one.getBoundingClientRect().left > innerWidth / 2)[0];
+  const ofRightColumn = (label) =>
+    document.querySelector(`[style*="top: 0px; bottom: 0px; right: 0px"] [aria-label="${label}"]`);
+
+  // viser gives the focus, and its frame, to the panel that was folded or unfolded: nobody has asked for that.
+  function fold(label) {
+    const found = ofRightColumn(label);
+    found?.click();
+    toggledAt = performance.now();
+    return found !== null;
+  }
 
   function button(text, label, press) {
     const made = document.createElement("button");
@@ -80,14 +89,10 @@
   function toggle() {
     projector = !projector;
     document.body.classList.toggle("projector", projector);
-    if (projector) {
-      rightmost(FOLD)?.click();
-      folded = true;
-    } else {
-      rightmost(UNFOLD)?.click();
-      folded = false;
-    }
-    toggledAt = performance.now();
+    const roomy = innerWidth >= ROOMY_PX;
+    fold(projector || !roomy ? FOLD : UNFOLD);
+    if (!projector) roomMade = foldedHere = !roomy;
+    folded = projector;
     look();
   }
 
@@ -100,13 +105,17 @@
     title.click();
   }
 
-  // In a window that is not that narrow, as a zoomed one, two panels would leave a strip of the canvas. A lesson, which
-  // shows the page in a frame, hides them itself.
+  // In a window that is not that narrow, as a zoomed one, two panels would leave a strip of the canvas: the right one is
+  // folded, until the window is wider again or a person unfolds it. A lesson, which shows the page in a frame, hides them
+  // itself.
   function makeRoom() {
-    if (roomMade || small() || window !== window.top || !document.querySelector("[data-ready]")) return;
-    const fold = innerWidth < ROOMY_PX ? rightmost(FOLD) : undefined;
-    roomMade = fold !== undefined || innerWidth >= ROOMY_PX;
-    fold?.click();
+    if (small() || projector || window !== window.top || !document.querySelector("[data-ready]")) return;
+    if (innerWidth >= ROOMY_PX) {
+      if (foldedHere) fold(UNFOLD);
+      roomMade = foldedHere = false;
+    } else if (!roomMade) {
+      roomMade = foldedHere = fold(FOLD);
+    }
   }
 
   function look() {
@@ -124,15 +133,19 @@
       place();
     }
     markEnds();
+    const ready = document.querySelector("[data-ready]");
+    if (innerWidth !== toldWindow && ready) {
+      toldWindow = innerWidth;
+      tell(`window:${innerWidth}`);
+    }
     const width = projector ? innerWidth : 0;
-    if (width !== toldWidth && document.querySelector("[data-ready]")) {
+    if (width !== toldWidth && ready) {
       toldWidth = width;
       tell(`projector:${width}`);
     }
   }
 
   setInterval(look, EVERY_MS);
-  // viser gives the focus, and its frame, to the panel that was folded or unfolded: nobody has asked for that.
   for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, () => { toggledAt = -Infinity; }, true);
   addEventListener("focusin", ({ target }) => {
     const given = performance.now() - toggledAt < FOLDED_MS && target instanceof HTMLElement && !bar?.contains(target);

@@ -84,6 +84,12 @@ class Touches:
                 self._failed(error)
 
 
+def pixels_of(touch: Touch) -> int:
+    """The width that a press tells as its argument, px; 0 if that is none."""
+    told = touch.argument
+    return int(told) if told.isascii() and told.isdecimal() and len(told) < 6 else 0
+
+
 def parse(report: Any) -> Touch | None:
     """The press of a report; None if the report is invalid."""
     try:
