@@ -401,6 +401,23 @@ def test_across_the_seam_the_curve_goes_on(server: viser.ViserServer, runs: dict
     assert np.allclose(tops, distinct, atol=0.06)
 
 
+def test_who_walks_back_sees_what_was_there_before(server: viser.ViserServer, runs: dict[str, Trace]) -> None:
+    """Contents are kept by step, selection and window."""
+    view, _, _ = make(server)
+    run, kept = runs["mc"], np.arange(120)
+    keys = [step.key for step in steps(run)]
+    charts = {key: paint(run, keys.index(key)).charts[0] for key in ("yaw-arcs-10", "yaw-clique")}
+    seen: dict[str, list[str]] = {key: [] for key in charts}
+    for pair in ((), (), (0, 1)):
+        for key, chart in charts.items():
+            view.draw(run, key, pair, kept, step_chart=chart)
+            seen[key].append(view._html.content)
+    assert all(first is second and first != other for first, second, other in seen.values())
+    assert seen["yaw-clique"][0] != seen["yaw-arcs-10"][0]
+    view.draw(replace(run), "yaw-clique", (), kept, step_chart=charts["yaw-clique"])
+    assert view._html.content == seen["yaw-clique"][0]
+
+
 def test_nothing_is_sent_if_nothing_changed(server: viser.ViserServer, runs: dict[str, Trace]) -> None:
     view, _, _ = make(server)
     view.draw(runs["mc"], "yaw-arcs", (), np.arange(120))

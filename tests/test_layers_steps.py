@@ -15,7 +15,7 @@ from spherloc.problem import Problem
 from spherloc.solvers.two_point import two_point
 from spherloc.trace import ConsensusStage, RansacStage, RefinementStage, Stage, Trace, TranslationStage, YawStage
 from spherloc_viz import style
-from spherloc_viz.layers import paint, ring, steps, yaw
+from spherloc_viz.layers import MAX_PICTURES, paint, ring, steps, yaw
 from spherloc_viz.layers.frame import RunView
 from spherloc_viz.layers.primitives import Balls, Label, Picture, Points, SceneItem, Segments, true_minus
 from spherloc_viz.layers.ransac import MAX_IMPROVEMENTS
@@ -100,6 +100,20 @@ def test_nothing_is_drawn_before_it_is_looked_at(mc: Trace, monkeypatch: pytest.
     for name in ("colors", "standing", "aligned_pose"):
         monkeypatch.setattr(RunView, name, refuse)
     assert len(steps(replace(mc))) > 20
+
+
+def test_pictures_are_kept_for_those_who_walk_back(mc: Trace) -> None:
+    """Some of them, of one run; what is told and an image that is written later make another picture."""
+    trace = replace(mc)
+    first = paint(trace, 3)
+    assert paint(trace, 4) is not first and paint(trace, 3) is first
+    assert paint(trace, 3, told=False) is not first
+    for index in range(4, 4 + MAX_PICTURES):
+        paint(trace, index)
+    again = paint(trace, 3)
+    assert again is not first, "not all of them"
+    assert [item.name for item in again.scene] == [item.name for item in first.scene]
+    assert paint(replace(trace), 3) is not again
 
 
 def test_charts_stay_and_the_newest_of_a_name_is_shown(mc: Trace) -> None:

@@ -32,6 +32,7 @@ from spherloc_viz.layers import (
 )
 from spherloc_viz.layers.frame import Plan, RunView, focus_of
 from spherloc_viz.layers.primitives import Chart, Graph, Picture, Step, StepHeading
+from spherloc_viz.layers.query_image import modified
 from spherloc_viz.layers.scene import base_items, camera
 
 STAGES: dict[type[Stage], tuple[str, Callable[[RunView, Any], list[Plan]]]] = {
@@ -48,6 +49,8 @@ KINDS = tuple(stage.kind for stage in STAGES)
 """Kinds of the stages that are spherloc's own."""
 FIRST, LAST = "Matches", "Outcome"
 """Names of the first and the last stage, which every run has."""
+MAX_PICTURES = 24
+"""Largest number of a run's pictures that are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +62,9 @@ class _Timeline:
     """Charts that were drawn already; they are reused by all later steps."""
 
     graphs: dict[Callable[[], Graph], Graph | None] = field(default_factory=dict)
+    pictures: dict[tuple[int, bool, int], Picture] = field(default_factory=dict)
+    """The pictures that were painted last, for those who walk back and forth: by the step, whether what came out was
+    told, and when the query image was written."""
 
     def _until(self, index: int, told: bool) -> list[Plan]:
         """The steps up to one, without those that tell what came out unless that is ``told``."""
@@ -142,12 +148,21 @@ def graph_begins(trace: Trace) -> str:
 
 
 def paint(trace: Trace, index: int, told: bool = True) -> Picture:
-    """The picture of the step at ``index``. Charts of earlier steps are kept.
+    """The picture of the step at ``index``. Charts of earlier steps are kept, and some pictures.
 
     Unless what came out is to be ``told``, a step that tells it has the picture of the last one before it that does
     not; ``trace`` is then to be without it too (``withheld.untold``).
     """
-    timeline = _timeline(trace)
+    timeline, image = _timeline(trace), trace.problem.image
+    key = index, told, 0 if image is None else modified(image)
+    kept = timeline.pictures
+    picture = kept[key] = kept.pop(key, None) or _painted(timeline, index, told)
+    if len(kept) > MAX_PICTURES:
+        del kept[next(iter(kept))]
+    return picture
+
+
+def _painted(timeline: _Timeline, index: int, told: bool) -> Picture:
     shown = index if told else withheld.last_untold(timeline.plans, index)
     plan, heading = timeline.plans[shown], timeline.headings[shown]
     frame = plan.draw() if told or plan.untold is None else plan.untold()

@@ -276,6 +276,8 @@ def _tips(bars: ArcBars) -> list[str]:
 NO_ARCS = PairArcs(np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0), "")
 UNTOLD = "Answers are hidden: the estimate, and which arcs are of right matches, are told once they are revealed."
 PEAK, WHOLE = "Zoom to the peak", "All yaws"
+MAX_MADE = 24
+"""Largest number of a run's contents that are kept."""
 MIN_DRAG = 0.012
 """Share of the plot that a press must cross to count as a drag."""
 
@@ -291,6 +293,10 @@ class YawView:
         self._peak: Window = ALL
         self._known: tuple[Trace, YawStory] | None = None
         self._arcs: tuple[Trace, tuple[int, ...], PairArcs] | None = None
+        self._made_of: Trace | None = None
+        self._made: dict[tuple, tuple[str, Window]] = {}
+        """The contents that were made last for that run, for those who walk back and forth: with their window of the
+        peak, by what was asked for."""
         self._drawn: tuple | None = None
         self._buttons = gui.add_button_group("Yaw", (PEAK, WHOLE))
         self._html = gui.add_html("")
@@ -314,16 +320,37 @@ class YawView:
         """
         with self._lock:
             wanted = self._wanted
-        story = self._story(trace)
-        hypothesis = step_key.removesuffix("-pose")
-        shown_key = hypothesis if any(hypothesis == key for *_, key in story.hypotheses) else ""
-        drawn = (trace, shown_key, selected, wanted, hidden, step_chart)
-        if self._drawn is not None and self._drawn[1:] == drawn[1:] and self._drawn[0] is trace:
+        of_step = step_key if step_chart is not None else self._hypothesis(trace, step_key)
+        asked = (of_step, selected, wanted, hidden, step_chart)
+        if self._made_of is not trace:
+            self._made_of, self._made, self._drawn = trace, {}, None
+        if asked == self._drawn:
             return
         if hidden and step_chart is None:
-            update_widget(self._html, content=status_html(WITHHELD))
-            self._drawn = drawn
-            return
+            content = status_html(WITHHELD)
+        else:
+            content, peak = self._made[asked] = self._made.pop(asked, None) or self._make(
+                trace, step_key, selected, kept, hidden, step_chart, wanted
+            )
+            if len(self._made) > MAX_MADE:
+                del self._made[next(iter(self._made))]
+            with self._lock:
+                self._peak = peak
+        update_widget(self._html, content=content)
+        self._drawn = asked
+
+    def _make(
+        self,
+        trace: Trace,
+        step_key: str,
+        selected: tuple[int, ...],
+        kept: NDArray[np.int64],
+        hidden: bool,
+        step_chart: Chart | None,
+        wanted: Window | None,
+    ) -> tuple[str, Window]:
+        """The content of the panel, whose window is ``wanted`` or else that of the peak; and that of the peak."""
+        story = self._story(trace)
         arcs = NO_ARCS if hidden else arcs_of_step(self._arcs_of(trace, selected), trace, step_key)
         if step_chart is not None:
             story = at_step(story, step_chart, arcs)
@@ -331,17 +358,19 @@ class YawView:
             story = untold(story)
         peak = peak_window(story, arcs)
         window = peak if wanted is None else wanted
-        with self._lock:
-            self._peak = peak
         bars = bars_in(trace, arcs, window, selected)
         note = escape(UNTOLD if hidden else caption(trace, story, arcs, bars))
         content = box(
             f'<div style="font-weight:600;padding-bottom:.3em">{escape(story.title)}{help_html("arc")}</div>'
-            f"{bars_html(bars)}{yaw_svg(story, bars, window, kept, shown_key)}"
+            f"{bars_html(bars)}{yaw_svg(story, bars, window, kept, self._hypothesis(trace, step_key))}"
             f'<div style="font-size:12px;opacity:.7;padding-top:.3em">{note}</div>'
         )
-        update_widget(self._html, content=content)
-        self._drawn = drawn
+        return content, peak
+
+    def _hypothesis(self, trace: Trace, step_key: str) -> str:
+        """The key of the pose that was tried at a step; empty if none was."""
+        key = step_key.removesuffix("-pose")
+        return key if any(key == known for *_, known in self._story(trace).hypotheses) else ""
 
     def _story(self, trace: Trace) -> YawStory:
         if self._known is None or self._known[0] is not trace:
