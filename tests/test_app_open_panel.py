@@ -166,7 +166,11 @@ def test_folders_of_cameras_are_offered_as_one_map_unless_a_link_leads_out(visit
     assert "map-folder:0:rig" in visitor.rows
     assert "Make a map of the 4 photographs in the folders left and right" in visitor.panel._list.content
     visitor.touch("open-folder:0:0:rig/left")
-    assert "Make a map of these 2 photographs" in visitor.panel._list.content
+    assert "Make a map of these 2 photographs<" in visitor.panel._list.content
+    (folder / "rig" / "left_map").mkdir()
+    (folder / "rig" / "left_map" / "scene.toml").write_text("")
+    visitor.touch("open-folder:0:0:rig/left")
+    assert "Make a map of these 2 photographs again<" in visitor.panel._list.content
 
     (folder.parent / "private").mkdir()
     (folder.parent / "private" / "0.png").touch()

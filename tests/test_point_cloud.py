@@ -4,13 +4,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from recording_samples import scene_problem
 
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.map_scene import MapScene
-from spherloc.geometry import camera_centre, yaw_rotation
+from spherloc.estimators import estimate
+from spherloc.geometry import camera_centre, pose, yaw_rotation
 from spherloc_viz import style
+from spherloc_viz.layers.frame import length_text
 from spherloc_viz.layers.point_cloud import MAX_NAMED, MAX_POINTS, REFERENCES, cloud_items
 from spherloc_viz.layers.primitives import Label, Points
+from spherloc_viz.layers.where_taken import where_taken
 
 
 def street() -> MapScene:
@@ -44,3 +48,28 @@ def test_few_references_are_named() -> None:
 def test_a_scene_with_a_mesh_or_without_points_has_none() -> None:
     assert cloud_items(street(), np.eye(3)) == ()
     assert cloud_items(replace(street(), cloud=np.empty((0, 3))), np.eye(3)) == ()
+
+
+def test_where_a_query_was_taken_is_told_by_the_nearest_references() -> None:
+    scene = street()
+    problem = scene_problem("mei_outliers_80")
+    centres = [camera_centre(view.cam_from_map) for view in scene.references if view.cam_from_map is not None]
+    along = (centres[1] - centres[0]) / np.linalg.norm(centres[1] - centres[0])
+    trace = estimate(problem, "ransac-2p")
+    here = centres[0] + 0.25 * np.linalg.norm(centres[1] - centres[0]) * along
+    at = replace(trace, cam_from_map=pose(np.eye(3), -here))
+    apart_m = sorted(float(np.linalg.norm(centre - here)) for centre in centres)[:2]
+    said = where_taken(scene, at)
+    names = [view.name for view in scene.references[:2]]
+    assert said.startswith(
+        f"Taken {length_text(apart_m[0])} from {names[0]} and {length_text(apart_m[1])} from {names[1]}."
+    )
+    assert "Its truth is the pose that the map's files give it" in said
+    blind = replace(at, problem=replace(problem, truth_cam_from_map=None, truth_inliers=None))
+    assert where_taken(scene, blind) == said.partition(" Its truth")[0]
+    assert where_taken(scene, replace(at, cam_from_map=None)) == ""
+    own = replace(scene, references=tuple(replace(view, path=Path("own.png")) for view in scene.references[:1]))
+    own = replace(own, references=(*own.references, *scene.references[1:]))
+    said = where_taken(own, replace(blind, problem=replace(blind.problem, image=Path("own.png"))))
+    assert said.startswith(f"Taken {length_text(apart_m[1])} from {names[1]} and ") and names[0] not in said
+    assert said.endswith("It is an image of the map itself.")

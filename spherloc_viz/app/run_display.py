@@ -29,8 +29,9 @@ from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.layers.key_step import key_step
 from spherloc_viz.layers.outcome import early_table
 from spherloc_viz.layers.point_cloud import cloud_items
-from spherloc_viz.layers.primitives import Label, Picture, SceneItem, Table
+from spherloc_viz.layers.primitives import Label, Picture, SceneItem, Segments, Table
 from spherloc_viz.layers.selection import with_selection
+from spherloc_viz.layers.where_taken import where_taken
 from spherloc_viz.layers.withheld import ANSWERS, OUTCOME, untold
 
 START_THEME = "dark"
@@ -199,6 +200,8 @@ class RunDisplay:
         # Where queries are named, the name of the ellipsoid would lie over that of the one at hand.
         left_out = {"uncertainty/sigmas"} if names and drawn.step.stage in NAMED_AT else names
         scene = drawn.scene + beside + self._cloud(run, drawn.step.stage)
+        if last and not names:
+            scene += self._query_name(run, drawn)
         drawn = replace(drawn, scene=tuple(item for item in scene if item.name not in left_out))
         self._shown = known, mesh, drawn
         with self._client.atomic():
@@ -214,9 +217,10 @@ class RunDisplay:
             plain = replace(picture, step=drawn.step)
             outcome = self._outcome_of(trace, known_judgement(known.trace))
             offered = hidden_html(withheld, not presenter) if withheld else ""
-            cause = ("", "")
+            where = self._where(run) if last and not hidden else ""
+            cause = "", where
             if diagnosis is not None and diagnosis.doubtful:
-                cause = str(diagnosis.cause), diagnosis.summary if last else ""
+                cause = str(diagnosis.cause), f"{diagnosis.summary} {where}".strip() if last else ""
             self.panels.draw(run, plain, pause is not None, outcome, selected, not told, offered, cause)
             self.panels.diagnose("" if hidden else _diagnosed_html(trace, diagnosis, index))
             self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, not told)
@@ -230,6 +234,11 @@ class RunDisplay:
         scene = self._scene_of(label)
         known = self._shown is not None and self._shown[0].request.scene.scene == label
         return not known and scene is not None and scene.cloud is not None
+
+    def _where(self, run: Run) -> str:
+        """Where the query of a map of photographs was taken."""
+        scene = self._scene_of(run.request.scene.scene)
+        return "" if scene is None or scene.cloud is None else where_taken(scene, run.trace)
 
     def _outcome_of(self, trace: Trace, judged: Judgement | None) -> Table:
         """The table of the outcome, which is the same at all steps."""
@@ -246,6 +255,15 @@ class RunDisplay:
             self._around = scene, turn, cloud_items(scene, turn)
         items = self._around[2]
         return items if stage in NAMED_AT else tuple(item for item in items if not isinstance(item, Label))
+
+    def _query_name(self, run: Run, picture: Picture) -> tuple[SceneItem, ...]:
+        """The name of the query of a map of photographs, over its camera."""
+        scene, query = self._scene_of(run.request.scene.scene), run.request.scene.query
+        camera = next((item for item in picture.scene if item.name == "cameras/estimate"), None)
+        if scene is None or scene.cloud is None or query is None or not isinstance(camera, Segments):
+            return ()
+        (x, y, z), top = camera.points[0, 0], float(camera.points[..., 1].min())  # y points down
+        return (Label("cloud/query", "cameras", np.array([x, top - 0.2 * (y - top), z]), query),)
 
     def _untold(self, run: Run, withheld: frozenset[str]) -> Run:
         """The run without what is withheld of it."""

@@ -255,6 +255,7 @@ def test_a_folder_of_photographs_becomes_a_map_and_opens(
     scene = load_scene(folder.with_name("square_map") / "scene.toml")
     assert isinstance(scene, MapScene) and scene.metric
     expect(tab.page.locator(".step-title")).to_have_text("Outcome")
+    expect(tab.page.get_by_text(re.compile(r"^Taken .* m from reference_00\d.png and .* m from "))).to_be_visible()
     tab.tab("Play")
     expect(tab.widget("Scene")).to_have_value(scene.name)
     expect(tab.value("inliers")).not_to_have_text(inliers)

@@ -217,7 +217,7 @@ class Controls:
             self._sweep = SweepPanel(gui, touches, self._chosen_sweep, services.recorder)
         with tabs.add_tab("Open"):
             self.review.stand(gui)
-            gui.add_html(heading_html("Other scenes, and matches of your own", "scene"))
+            gui.add_html(heading_html("Other scenes, your own photographs, and your own matches", "scene"))
             self._open = OpenPanel(gui, client, touches, services.roots, self._open_scene, self._scene_file)
         with tabs.add_tab("Recordings"):
             self.review.stand(gui)

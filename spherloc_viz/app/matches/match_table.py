@@ -8,7 +8,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from spherloc.errors import InputError, show
+from spherloc.errors import InputError, shorten, show
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc.types import BoolArray, IntArray
@@ -29,6 +29,8 @@ from spherloc_viz.layers.matches import (
 )
 
 MAX_REFERENCES = 8
+MAX_LETTERS = 18
+"""Longest name of a reference that its button shows in full."""
 
 
 def chips_html(problem: Problem, inlier_mask: BoolArray, shown: int | None) -> str:
@@ -41,7 +43,7 @@ def chips_html(problem: Problem, inlier_mask: BoolArray, shown: int | None) -> s
     offered += [] if shown in offered else [shown]
     chips = "".join(
         chip(
-            f"{k + 1}: {inliers[k]}/{matches[k]}",
+            f"{shorten(problem.reference_images[k].name, MAX_LETTERS)}: {inliers[k]}/{matches[k]}",
             f"image-reference:{k}",
             k == shown,
             f"{problem.reference_images[k].name}: {inliers[k]} inliers of {matches[k]} matches",

@@ -42,6 +42,8 @@ class MapPanel:
         self._stop.on_click(lambda event: self.close())
         self._save.on_click(lambda event: self._save_report())
         self._report: Path | None = None
+        self._told = ""
+        """What is said of the map that was made last, as HTML."""
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
         self._stopped = False
@@ -62,7 +64,6 @@ class MapPanel:
             )
         self._say(f"Making a map of {folder.name} …")
         self._bar.value, self._bar.visible, self._stop.visible = 0.0, True, True
-        self._save.visible = False
         threading.Thread(target=self._follow, args=(process, folder), name="spherloc-map", daemon=True).start()
 
     def close(self) -> None:
@@ -85,14 +86,14 @@ class MapPanel:
             self._process, stopped = None, self._stopped
         self._bar.visible = self._stop.visible = False
         if "scene" in said:
-            self._text.content = box(_table(said["summary"]), "font-size:12px;overflow-wrap:anywhere")
-            self._report, self._save.visible = Path(said["report"]), True
+            self._told = box(_table(said["summary"]), "font-size:12px;overflow-wrap:anywhere")
+            self._text.content, self._report, self._save.visible = self._told, Path(said["report"]), True
             self._finished(Path(said["scene"]))
         elif stopped:
             self._say("Stopped; what was done is kept for the next time.")
         else:
             sentence = str(said.get("error", "the map could not be made; try the command spherloc map."))
-            self._text.content = status_html(begun(sentence), wrong=True)
+            self._text.content = status_html(begun(sentence), wrong=True) + self._told
 
     def _save_report(self) -> None:
         """Send the report to the browser, which saves it."""

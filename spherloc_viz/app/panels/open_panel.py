@@ -3,7 +3,7 @@
 import json
 import threading
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 
@@ -12,8 +12,10 @@ import viser
 from spherloc.datasets import Scene, bundled_scenes, load_scene
 from spherloc.disk_cache import cache_folder, store
 from spherloc.errors import InputError
+from spherloc.files import is_file
 from spherloc.mapping.new_queries import add_new_images, map_images
 from spherloc.mapping.photographs import MIN_IMAGES
+from spherloc.mapping.scene_files import SCENE
 from spherloc_viz.app.panels.folders import Listing, Roots, Row, describe
 from spherloc_viz.app.panels.map_panel import OUTPUT, MapPanel
 from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_CALIBRATION_BYTES, File, Scratch, UploadForm, open_upload
@@ -32,7 +34,9 @@ MAX_NAMED = 3
 RULE = "border-top:1px solid rgba(128,140,160,.22)"
 
 
+AGAIN_ABOUT = "What was done is kept: with another Scale it takes some seconds. It opens when it is done."
 NEW_ABOUT = "The first is localized at once; the others are under Sequence in the tab Play."
+ONE_ABOUT = "It is localized at once."
 
 
 def list_html(
@@ -42,14 +46,16 @@ def list_html(
     bundled: Sequence[Row],
     remark: str,
     in_map: str = "",
+    made: bool = False,
 ) -> str:
     """A folder's content, or the folders that may be looked into; then recent and bundled scenes. ``in_map`` is what
-    the map is called in which the folder's photographs can be localized; empty for none."""
+    the map is called in which the folder's photographs can be localized; empty for none. ``made`` says whether there is
+    a map of them."""
     if listing is None:
         folders = [_row_html(f"open-folder:0:{k}:", f"{root.name}/", str(root)) for k, root in enumerate(roots)]
         parts = [_section("Folders", folders)]
     else:
-        parts = [_folder_html(listing, in_map)]
+        parts = [_folder_html(listing, in_map, made)]
     parts += [_section(title, [_scene_html(row) for row in rows]) for title, rows in _titled(recent, bundled)]
     return box("".join(parts), "font-size:12.5px") + (status_html(remark) if remark else "")
 
@@ -58,15 +64,16 @@ def _titled(recent: Sequence[Row], bundled: Sequence[Row]) -> list[tuple[str, Se
     return [(title, rows) for title, rows in (("Recent", recent), ("Bundled", bundled)) if rows]
 
 
-def _folder_html(listing: Listing, in_map: str) -> str:
+def _folder_html(listing: Listing, in_map: str, made: bool) -> str:
     """Folder by folder; first the way up, last the other pages."""
     above = "open-folder:" if listing.parent is None else f"open-folder:0:{listing.parent}"
     rows = [_row_html(above, "↑ up" if listing.parent else "↑ all folders", "")]
     if in_map and (count := listing.photographs or sum(listing.in_folders.values())):
-        these = "this photograph" if count == 1 else f"these {count:,} photographs"
+        these, about = ("this photograph", ONE_ABOUT) if count == 1 else (f"these {count:,} photographs", NEW_ABOUT)
         rows.append(_row_html(f"localize-folder:{listing.place}", f"Localize {these} in {in_map}", NEW_ABOUT))
     if title := _map_title(listing):
-        rows.append(_row_html(f"map-folder:{listing.place}", title, MAP_ABOUT))
+        title, about = (f"{title} again", AGAIN_ABOUT) if made else (title, MAP_ABOUT)
+        rows.append(_row_html(f"map-folder:{listing.place}", title, about))
     for row in listing.rows:
         if row.kind == "folder":
             rows.append(_row_html(f"open-folder:0:{row.place}", f"{row.name}/", ""))
@@ -269,12 +276,17 @@ class OpenPanel:
         self._say("")
 
     def _make_map(self, place: str) -> None:
-        """Make a map: beside the folder, as the command does, or inside it if pages may not write beside it."""
+        """Make a map of a folder's photographs."""
         folder = self._roots.find(place)
         if not folder.is_dir() or not _map_title(self._roots.look_into(place)):
             raise InputError("this is not a folder of photographs; choose one from the list.")
+        self._map.start(folder, self._map_of(folder))
+
+    def _map_of(self, folder: Path) -> Path:
+        """Where the map of a folder is put: beside it, as the command does, or inside it if pages may not write beside
+        it."""
         above = folder if self._roots.place(folder.parent) is None else folder.parent
-        self._map.start(folder, above / f"{folder.name}{OUTPUT}")
+        return above / f"{folder.name}{OUTPUT}"
 
     def _localize(self, place: str) -> None:
         """Open a scene of a folder's photographs in the map that the page shows; it is written beside the map's own."""
@@ -334,13 +346,15 @@ class OpenPanel:
     def _list_html(self, listing: Listing | None) -> str:
         recent, remark = self._recent.read()
         if not self._bundled:
-            self._bundled = self._described(bundled_scenes().values())
+            self._bundled = [row for _, row in self._described(bundled_scenes().values())]
         in_map = "" if listing is None else self._map_for(listing)
-        return list_html(listing, self._roots.folders, self._described(recent), self._bundled, remark, in_map)
+        made = listing is not None and is_file(self._map_of(listing.folder) / SCENE)
+        last = [replace(row, name=f"{path.parent.name}/{row.name}") for path, row in self._described(recent)]
+        return list_html(listing, self._roots.folders, last, self._bundled, remark, in_map, made)
 
-    def _described(self, paths: Iterable[Path]) -> list[Row]:
+    def _described(self, paths: Iterable[Path]) -> list[tuple[Path, Row]]:
         """Those of the files that are there and allowed."""
-        return [describe(path, place) for path in paths if (place := self._place(path)) is not None]
+        return [(path, describe(path, place)) for path in paths if (place := self._place(path)) is not None]
 
     def _place(self, path: Path) -> str | None:
         """What names a scene file to ``Roots.find``; None if it is gone or not allowed."""
