@@ -22,12 +22,12 @@ def where_taken(scene: MapScene, trace: Trace) -> str:
     here = camera_centre(trace.cam_from_map)
     others = [view for view in scene.references if view.path != trace.problem.image]
     posed = [(view.name, view.cam_from_map) for view in others if view.cam_from_map is not None]
-    apart_m = np.array([float(np.linalg.norm(camera_centre(pose) - here)) for _, pose in posed])
-    nearest = np.argsort(apart_m, kind="stable")[:NAMED].tolist()
-    if not nearest:
+    apart_m = [(float(np.linalg.norm(camera_centre(pose) - here)), name) for name, pose in posed]
+    if not apart_m:
         return ""
     told = " and ".join(
-        f"{length_text(apart_m[k], scene.metric)} from {shorten(posed[k][0], MAX_LETTERS)}" for k in nearest
+        f"{length_text(metres, scene.metric)} from {shorten(name, MAX_LETTERS)}"
+        for metres, name in sorted(apart_m)[:NAMED]
     )
     truth = trace.problem.truth_cam_from_map
     more = " It is an image of the map itself." if len(others) < len(scene.references) else ""
