@@ -207,6 +207,27 @@ def test_balls_are_on_the_screen_at_every_step_that_one_walks_to(tab: Playground
     tab.expect_quiet(address)
 
 
+HURRY = """async () => {
+    const go = (step) => dispatchEvent(new CustomEvent("spherloc-touch", {detail: `step:${step}`}));
+    const tabs = () => [...document.querySelectorAll("[role=tab][aria-selected=true]")];
+    const chosen = () => tabs().some((one) => one.textContent.trim() === "Residuals");
+    go("outcome");
+    while (!chosen()) await new Promise(requestAnimationFrame);
+    go("clique");
+}"""
+"""Goes to a step, and on to another one as soon as the view of the first has come to the front."""
+
+
+def test_the_view_follows_who_walks_fast(tab: Playground, address: str) -> None:
+    """What the page itself has brought to the front is nobody's choice, also before it has seen it there."""
+    tab.page.evaluate("dispatchEvent(new CustomEvent('spherloc-touch', {detail: 'step:yaw-clique'}))")
+    expect(tab.page.get_by_role("tab", name="Yaw", exact=True)).to_have_attribute("aria-selected", "true")
+    tab.page.evaluate(HURRY)
+    expect(tab.page.get_by_role("tab", name="Graph", exact=True)).to_have_attribute("aria-selected", "true")
+    expect(tab.page.get_by_text("Graph and matrix")).to_be_visible()
+    tab.expect_quiet(address)
+
+
 COUNT_MOVES = """() => {
     window.smoothMoves = 0;
     window.__viserMutable.cameraControl.addEventListener("transitionstart", () => window.smoothMoves++);

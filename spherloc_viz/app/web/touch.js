@@ -12,6 +12,7 @@
   let revealUntil = new Map();  // by the names of the elements that are to be revealed: until when they are scrolled to
   // The tabs of a step and of a link that were opened last, among the views and elsewhere, and the last report.
   let front = "", asked = "", elsewhere = "", told = "";
+  let opening = "";  // the tab of a step that this script has pressed: it may come to the front after the next step
   const fetched = new Set();  // downloads that were begun
 
   function found(event) {
@@ -59,9 +60,11 @@
   // link asks for another one.
   function followStep() {
     const wanted = document.querySelector("[data-front]")?.dataset.front ?? "", views = (seen ?? "").split(",");
-    if (!wanted || wanted === front || seen === null) return;
+    const late = opening !== front && views.includes(opening);  // what was opened for a step that has been left since
+    if (!wanted || (wanted === front && !late) || seen === null) return;
     if (front !== "" && seen === "") return; // no view is to be seen, as while one is drawn anew: nobody has left it
-    const follows = (front === "" || views.includes(front)) && linkedTab() === asked;
+    const follows = (front === "" || views.includes(front) || views.includes(opening)) && linkedTab() === asked;
+    if (follows) opening = wanted;
     if (follows && !openTab(wanted)) return;
     front = wanted;
   }
