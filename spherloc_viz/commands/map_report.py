@@ -184,7 +184,7 @@ def _lines_of(made: Map, name: str) -> str:
     """What the lines of an image tell of gravity: its bound, or why they tell nothing."""
     if name in made.lines.why_not:
         return f"none: {made.lines.why_not[name]}"
-    return f"within {np.degrees(made.lines.found[name].bound_rad or 0.0):.1f}°"
+    return f"found, at most {np.degrees(made.lines.found[name].bound_rad or 0.0):.1f}° off"
 
 
 def _off(made: Map, name: str) -> str:
