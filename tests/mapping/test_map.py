@@ -603,7 +603,7 @@ def test_why_lines_give_no_gravity_is_told_of_each_image(walk, tmp_path):
     """In the summary of the first one, in the report of each, and with the number that is needed for a map."""
     _, found, made, *_ = walk
     assert made.lines.found.keys() == made.written.poses.keys() and not made.lines.why_not
-    assert "no gravity" not in "".join(summary(made, found)) and "<td>within " in map_report(made, found)
+    assert "no gravity" not in "".join(summary(made, found)) and "<td>found, at most " in map_report(made, found)
     name = sorted(made.lines.found)[1]
     assert cv2.imwrite(str(tmp_path / "blank.png"), np.full((200, 400), 90, np.uint8))
     blank = replace(found.views[1], path=tmp_path / "blank.png", camera=Equirectangular(400, 200), mask=None)
