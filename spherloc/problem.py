@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera
 from spherloc.errors import ProblemError, show
-from spherloc.geometry import align_to_down, pose, tangent_basis
+from spherloc.geometry import align_to_down, pose
 from spherloc.ranges import MAX_M, MAX_PX, MIN_M, MIN_PX, is_number
 from spherloc.types import BoolArray, FloatArray, IntArray
 
@@ -156,13 +156,8 @@ class Problem:
         count, usable = len(self), self.usable
         inverse = np.full((count, 2, 3), np.nan)
         largest = np.full(count, np.nan)
-        basis = tangent_basis(self.bearings[usable])
-        jacobian = basis @ self.camera.unprojection_jacobian(self.pixels[usable])
-        left, stretch, right = np.linalg.svd(jacobian)
-        largest[usable] = stretch[:, 0]
-        # At a panorama's pole one singular value is 0; without a lower limit, a residual in that direction would be 0.
-        stretch = np.maximum(stretch, MIN_STRETCH * stretch[:, :1])
-        inverse[usable] = np.einsum("nji,nj,nkj,nkl->nil", right, 1.0 / stretch, left, basis)
+        bearings, jacobian = self.bearings[usable], self.camera.unprojection_jacobian(self.pixels[usable])
+        inverse[usable], largest[usable] = _inverted(bearings, jacobian)
         return _frozen(inverse), _frozen(largest)
 
     @property
@@ -271,6 +266,31 @@ class AlignedProblem:
         full = np.zeros(self.count, dtype=bool)
         full[self.index[mask]] = True
         return full
+
+
+def _inverted(bearings: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverses (M, 2, 3) of unprojection Jacobians (M, 3, 2) on the tangent planes of bearings (M, 3), and the larger
+    singular value (M,) of each.
+
+    A rotation of the pixel plane makes the columns of a Jacobian orthogonal, so that they are its singular vectors.
+    """
+    u, v = jacobian[:, :, 0], jacobian[:, :, 1]
+    angle = 0.5 * np.arctan2(2.0 * _dot(u, v), _dot(u, u) - _dot(v, v))
+    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    along, across = cos * u + sin * v, cos * v - sin * u
+    largest = np.sqrt(_dot(along, along))[:, None]
+    along /= largest
+    side: FloatArray = np.cross(bearings, along)
+    smallest = _dot(side, across)[:, None]
+    # At a panorama's pole one singular value is 0; without a lower limit, a residual in that direction would be 0.
+    across = side / np.copysign(np.maximum(np.abs(smallest), MIN_STRETCH * largest), smallest)
+    along /= largest
+    return np.stack([cos * along - sin * across, sin * along + cos * across], axis=1), largest[:, 0]
+
+
+def _dot(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Dot products (M,) of the rows of two (M, 3)."""
+    return np.einsum("ni,ni->n", first, second)
 
 
 def _check_reach(name: str, what: str, places_m: FloatArray, least_m: float = MIN_M) -> None:

@@ -6,7 +6,7 @@ drawn when it is looked at.
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from itertools import combinations
 from typing import Any, TypeVar
 
@@ -29,6 +29,8 @@ DENSE = (0.05, 0.95)
 """Quantiles of each coordinate between which the map lies; points outside count as strays."""
 FEW_DOTS = 200
 """Largest number of dots with full size; if there are more, dots are smaller."""
+MAPS = 8
+"""Number of maps whose points were last shown of which is kept what does not depend on the run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,10 +93,24 @@ class RunView:
             known = self._kept[name] = key, make()
         return known[1]
 
+    def of_map(self, name: str, make: Callable[[], T]) -> T:
+        """The result of ``make``, which depends on the points of the map and their unit alone. Runs with the same
+        points, as while a slider of the noise is dragged, share it."""
+        if name not in self._of_map:
+            self._of_map[name] = make()
+        return self._of_map[name]
+
     @cached_property
+    def _of_map(self) -> dict[str, Any]:
+        points = self.trace.problem.points @ self.trace.problem.aligned.map_turn.T
+        made = _made_of_map(points.tobytes(), self.trace.problem.unit)
+        made.setdefault("points", points)
+        return made
+
+    @property
     def points(self) -> FloatArray:
         """Map points (N, 3) in the aligned map frame, metres."""
-        return self.trace.problem.points @ self.trace.problem.aligned.map_turn.T
+        return self._of_map["points"]
 
     @cached_property
     def numbers(self) -> NDArray[np.int64]:
@@ -104,18 +120,18 @@ class RunView:
     @cached_property
     def middle(self) -> FloatArray:
         """Component-wise median (3,) of the map points."""
-        return np.median(self.points, axis=0)
+        return self.of_map("middle", lambda: np.median(self.points, axis=0))
 
     @cached_property
     def dense_box(self) -> FloatArray:
         """Lower and upper corner (2, 3) of the map without its strays."""
         ends = [round(share * (len(self.points) - 1)) for share in DENSE]
-        return np.partition(self.points, ends, axis=0)[ends]
+        return self.of_map("dense box", lambda: np.partition(self.points, ends, axis=0)[ends])
 
     @cached_property
     def sphere_m(self) -> float:
         """Radius at which the unit sphere is drawn, metres."""
-        extent = float(np.median(np.linalg.norm(self.points - self.middle, axis=1)))
+        extent = self.of_map("extent", lambda: float(np.median(np.linalg.norm(self.points - self.middle, axis=1))))
         return SPHERE_SHARE * max(extent, 1e-3)
 
     @cached_property
@@ -306,6 +322,12 @@ FEW_BALLS = 3
 """Largest number of balls that are all framed completely."""
 
 
+@lru_cache(maxsize=MAPS)
+def _made_of_map(points: bytes, unit: str) -> dict[str, Any]:
+    """What was made of these points, by name: nothing at first."""
+    return {}
+
+
 def focus_of(view: RunView, frame: Frame) -> Focus:
     """The focus of a frame: its own, else its ring, else its sphere; the whole map where matches are drawn as rays or
     the camera has a position."""
@@ -315,14 +337,12 @@ def focus_of(view: RunView, frame: Frame) -> Focus:
         return ring_focus(view)
     if frame.located or frame.rays.any() or any(item.layer == "pairs" for item in frame.items):
         return map_focus(view, frame.cam_from_map)
-    return Focus(
-        "Sphere", view.kept("sphere focus", None, lambda: sphere_box(view.middle, SPHERE_ROOM * view.sphere_m))
-    )
+    return Focus("Sphere", view.of_map("sphere focus", lambda: sphere_box(view.middle, SPHERE_ROOM * view.sphere_m)))
 
 
 def ring_focus(view: RunView, *more: FloatArray) -> Focus:
     """The yaw ring, and ``more`` points (K, 3)."""
-    ring = view.kept("ring focus", None, lambda: circle(view.middle, RING_ROOM * view.sphere_m))
+    ring = view.of_map("ring focus", lambda: circle(view.middle, RING_ROOM * view.sphere_m))
     return Focus("Sphere", np.vstack([ring, *more]) if more else ring, ring)
 
 
@@ -332,7 +352,7 @@ def map_focus(view: RunView, cam_from_map: FloatArray, seen: BoolArray | None = 
     if seen is not None and np.count_nonzero(seen) >= FEW_SEEN:
         dense = dense_points(view.points[seen])
     else:
-        dense = view.kept("dense map", None, lambda: dense_points(view.points))
+        dense = view.of_map("dense map", lambda: dense_points(view.points))
     cameras = [cam_from_map] if view.truth is None else [cam_from_map, view.truth]
     boxes = [sphere_box(camera_centre(pose), CAMERA_ROOM * view.sphere_m) for pose in cameras]
     return Focus("Overview", np.vstack([dense, *boxes]), dense)

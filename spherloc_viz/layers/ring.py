@@ -162,8 +162,10 @@ def peaks(counts: np.ndarray, reach: int, most: int) -> np.ndarray:
     At a peak no count within ``reach`` places is larger, and no other peak is that close. Equal ones come in an order
     that jumps around the circle, so that a few of many do not lie side by side.
     """
-    around = np.pad(counts, reach, mode="wrap")
-    highest = np.lib.stride_tricks.sliding_window_view(around, 2 * reach + 1).max(axis=1)
+    highest, width = np.pad(counts, reach, mode="wrap"), 1
+    while width <= 2 * reach:  # the highest of ``width`` places in a row, each time of up to twice as many
+        step = min(width, 2 * reach + 1 - width)
+        highest, width = np.maximum(highest[:-step], highest[step:]), width + step
     candidates = np.flatnonzero((counts == highest) & (counts > 0))
     candidates = candidates[np.lexsort((candidates * GOLDEN % 1.0, -counts[candidates]))]
     found: list[int] = []

@@ -107,8 +107,8 @@ def base_items(view: RunView, frame: Frame) -> tuple[SceneItem, ...]:
         Points("map/points", "map", view.points, frame.colors, 0.07 * view.dot_m, view.numbers),
         *_sphere(view, frame),
         *view.kept("located", (pose, frame.located, is_close_up(frame)), lambda: _located(view, frame)),
-        *view.kept("scale bar", None, lambda: scale_bar(view)),
-        *view.kept("ground", None, lambda: ground(view)),
+        *view.of_map("scale bar", lambda: scale_bar(view)),
+        *view.of_map("ground", lambda: ground(view)),
     )
 
 
