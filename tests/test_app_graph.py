@@ -17,8 +17,9 @@ from spherloc_viz import style
 from spherloc_viz.app.plots.ball_list import ball_list_html, selected_rows
 from spherloc_viz.app.plots.graph_view import MAX_EDGES, cell_nodes, edges_of, graph_html, graph_note, matrix_png
 from spherloc_viz.layers import graph_begins, paint, steps
+from spherloc_viz.layers.ball_set import BallSet
+from spherloc_viz.layers.graph_nodes import MAX_NODES, ball_nodes, graph_at
 from spherloc_viz.layers.primitives import Graph
-from spherloc_viz.layers.translation import MAX_NODES, BallSet, ball_nodes, graph_at
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from spherloc.geometry import camera_centre, so3_exp
 from spherloc.problem import Problem
 from spherloc.trace import Trace
 from spherloc_viz.app.stage import views
-from spherloc_viz.app.stage.views import Walls
+from spherloc_viz.app.stage.walls import Walls
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.point_cloud import REFERENCES
 from spherloc_viz.layers.primitives import Focus, Label, Mesh, Points, Segments

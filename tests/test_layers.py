@@ -24,9 +24,9 @@ from spherloc.trace import (
 )
 from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
+from spherloc_viz.layers.ball_set import MAX_SURFACES
 from spherloc_viz.layers.outcome import outcome_table
 from spherloc_viz.layers.primitives import Balls, Curve, Label, Mesh, Picture, Points, SceneItem, Segments, Textured
-from spherloc_viz.layers.translation import MAX_SURFACES
 
 SCENES = sorted(name for name, path in bundled_scenes().items() if 'kind = "synthetic"' in path.read_text())
 

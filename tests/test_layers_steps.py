@@ -16,10 +16,10 @@ from spherloc.solvers.two_point import two_point
 from spherloc.trace import ConsensusStage, RansacStage, RefinementStage, Stage, Trace, TranslationStage, YawStage
 from spherloc_viz import style
 from spherloc_viz.layers import MAX_PICTURES, paint, ring, steps, yaw
+from spherloc_viz.layers.ball_set import BallSet
 from spherloc_viz.layers.frame import RunView
 from spherloc_viz.layers.primitives import Balls, Label, Picture, Points, SceneItem, Segments, true_minus
 from spherloc_viz.layers.ransac import MAX_IMPROVEMENTS
-from spherloc_viz.layers.translation import BallSet
 from spherloc_viz.layers.yaw import StageArcs
 
 

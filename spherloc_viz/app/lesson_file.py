@@ -26,7 +26,7 @@ from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.flat_picture import svg
 from spherloc_viz.app.stage.still_page import Still, scene_script, scripts_in, with_policy
-from spherloc_viz.app.stage.views import MAX_BYTES, Walls
+from spherloc_viz.app.stage.walls import MAX_BYTES, Walls
 from spherloc_viz.app.web.page import QUIET, client_html
 from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.layers.matches import match_view

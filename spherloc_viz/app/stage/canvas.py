@@ -15,7 +15,7 @@ from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.painter import LABEL_SCALE, Painter
 from spherloc_viz.app.stage.true_camera import TrueCamera
-from spherloc_viz.app.stage.views import MAX_BYTES, Walls
+from spherloc_viz.app.stage.walls import MAX_BYTES, Walls
 from spherloc_viz.layers.point_cloud import cloud_items, reference_dots
 from spherloc_viz.layers.primitives import Picture
 

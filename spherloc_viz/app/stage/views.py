@@ -1,8 +1,6 @@
 """Views: positions from which a picture can be read well, without a wall between the viewer and the subject."""
 
 from dataclasses import dataclass
-from functools import lru_cache
-from io import BytesIO
 
 import numpy as np
 import viser
@@ -10,59 +8,13 @@ from numpy.typing import NDArray
 
 from spherloc.geometry import yaw_rotation
 from spherloc.types import FloatArray
+from spherloc_viz.app.stage.subjects import centre_and_radius, followed, subject_of, surface_of, walk_at_end
+from spherloc_viz.app.stage.walls import Walls
 from spherloc_viz.app.web.viser_internals import place_viewer
-from spherloc_viz.layers import LAST
-from spherloc_viz.layers.frame import RING_ROOM, SPHERE_ROOM, circle, dense_points, sphere_box
-from spherloc_viz.layers.point_cloud import REFERENCES
 from spherloc_viz.layers.primitives import Label, Mesh, Picture, Points, SceneItem, Segments, Textured
 
-CELLS = 160
-"""Number of cells of the grid along the mesh's longest side."""
-SAMPLES = 400_000
-"""Number of points on the surface by which cells are marked."""
-STEPS = 64
-"""Number of samples along each line of sight."""
 TARGETS = 24
 """Number of points of a subject to which there should be a line of sight."""
-NEAR_SHARE, FAR = 0.08, 0.97
-"""Part of each line of sight that is tested, as shares from the viewer: the mesh may touch what is to be seen."""
-MAX_BYTES = 60 << 20
-"""Largest mesh that is read; with a larger one, views are chosen without it."""
-
-
-class Walls:
-    """Cells of a grid, in the aligned map frame, that hold some of a mesh's surface."""
-
-    def __init__(self, glb: bytes, aligned_from_map: FloatArray) -> None:
-        """``glb`` is a binary glTF in the map frame, ``aligned_from_map`` (3, 3) a rotation."""
-        self._turn = aligned_from_map
-        self._low, self._cell_m, self._filled = _grid(glb)
-
-    def blocked(self, position: FloatArray, targets: FloatArray) -> float:
-        """Share of the targets (K, 3) that cannot be seen from a position (3,)."""
-        along = np.linspace(NEAR_SHARE, FAR, STEPS)[:, None, None]
-        places = (position + along * (targets - position)) @ self._turn  # back into the map frame
-        cells = np.floor((places - self._low) / self._cell_m).astype(np.int64)
-        within = np.all((cells >= 0) & (cells < self._filled.shape), axis=-1)
-        x, y, z = np.moveaxis(np.where(within[..., None], cells, 0), -1, 0)
-        return float(np.mean(np.any(within & self._filled[x, y, z], axis=0)))
-
-
-@lru_cache(maxsize=2)
-def _grid(glb: bytes) -> tuple[FloatArray, float, NDArray[np.bool_]]:
-    """Lower corner (3,) and side of the cells, and which of them hold some of the surface."""
-    import trimesh  # takes a second
-
-    mesh = trimesh.load_mesh(BytesIO(glb), file_type="glb")
-    low, high = np.asarray(mesh.bounds, dtype=np.float64)
-    cell_m = float(np.max(high - low)) / CELLS
-    filled = np.zeros(np.floor((high - low) / cell_m).astype(np.int64) + 1, np.bool_)
-    places = np.asarray(trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)[0])
-    x, y, z = np.floor((places - low) / cell_m).astype(np.int64).T
-    filled[x, y, z] = True
-    return low, cell_m, filled
-
-
 FIELD_OF_VIEW_RAD = np.radians(45.0)
 WIDE_RAD = np.radians(85.0)
 """Field of view of a viewer inside the camera."""
@@ -164,7 +116,7 @@ def look(client: viser.ClientHandle, view: Viewpoint) -> None:
 def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: float = 0.0) -> Viewpoint:
     """The view of the step's subject, on a canvas with that aspect ratio, between ``walls``. If ``letter``, the width
     of a letter as a share of half the canvas' height, is not 0, the labels beside the subject are in view too."""
-    subject, clear = _followed(picture)
+    subject, clear = followed(picture)
     view = _clear(picture.focus.view, picture, subject, clear, aspect, walls)
     names = _names(picture, subject) if letter else []
     if not names:
@@ -173,17 +125,6 @@ def follow(picture: Picture, aspect: float, walls: Walls | None = None, letter: 
     insets = np.vstack([np.zeros((len(subject), 2)), _half_sizes(names, letter)])
     positions, targets = _fits(held, (view.position - view.target)[None], aspect, insets)
     return Viewpoint(positions[0], targets[0])
-
-
-def _followed(picture: Picture) -> tuple[FloatArray, FloatArray]:
-    """Points (K, 3) that the view of a step must hold, and those (L, 3) that are not to be hidden."""
-    focus = picture.focus
-    walk = _walk_at_end(picture)
-    if walk is not None:
-        return walk, walk
-    route = [item.positions for item in picture.scene if isinstance(item, Points) and item.layer == "trajectory"]
-    subject = np.vstack([focus.points, *route]) if focus.view == "Overview" else focus.points
-    return subject, subject if focus.clear is None else focus.clear
 
 
 def cut(picture: Picture, view: Viewpoint, aspect: float, letter: float) -> frozenset[str]:
@@ -233,8 +174,8 @@ def shows(view: Viewpoint, subject: FloatArray, aspect: float) -> bool:
 def fits(name: str | None, view: Viewpoint, picture: Picture, aspect: float) -> bool:
     """Whether a view of that name, or the step's view for None, still shows its subject."""
     if name is None:
-        return shows(view, _followed(picture)[0], aspect)
-    return same(view, _inside(picture)) if name == INSIDE else shows(view, _subject(name, picture), aspect)
+        return shows(view, followed(picture)[0], aspect)
+    return same(view, _inside(picture)) if name == INSIDE else shows(view, subject_of(name, picture), aspect)
 
 
 def projected(view: Viewpoint, positions: FloatArray) -> FloatArray:
@@ -251,10 +192,10 @@ def projected(view: Viewpoint, positions: FloatArray) -> FloatArray:
 def before_the_eyes(picture: Picture, position: FloatArray) -> frozenset[str]:
     """Names of the nodes to hide for a viewer at that position (3,) inside a camera: the camera and things around it,
     whose lines would cross the whole picture, and labels, which would cover the photograph."""
-    surface = _surface(picture)
+    surface = surface_of(picture)
     if surface is None:
         return frozenset()
-    close_m = CLOSE * _centre_and_radius(surface)[1]
+    close_m = CLOSE * centre_and_radius(surface)[1]
     cameras = [item for item in picture.scene if isinstance(item, Segments) and item.layer == "cameras"]
     names = {item.name for item in cameras if len(item.points) and _apart(item, position) < close_m}
     if "cameras/estimate" in names:
@@ -267,10 +208,10 @@ def before_the_eyes(picture: Picture, position: FloatArray) -> frozenset[str]:
 def over_the_walk(picture: Picture, position: FloatArray) -> frozenset[str]:
     """Names of the nodes of the sphere, if it would cover where photographs were taken at the outcome, for a viewer at
     that position (3,) outside of it."""
-    surface = _surface(picture)
-    if surface is None or _walk_at_end(picture) is None:
+    surface = surface_of(picture)
+    if surface is None or walk_at_end(picture) is None:
         return frozenset()
-    centre, radius_m = _centre_and_radius(surface)
+    centre, radius_m = centre_and_radius(surface)
     if np.linalg.norm(position - centre) < OUTSIDE * radius_m:
         return frozenset()
     return frozenset(item.name for item in picture.scene if item.layer in ("sphere", "image"))
@@ -278,27 +219,15 @@ def over_the_walk(picture: Picture, position: FloatArray) -> frozenset[str]:
 
 def inside(picture: Picture, position: FloatArray) -> bool:
     """Whether a viewer at that position (3,) is in the estimated camera or in the sphere's centre."""
-    surface = _surface(picture)
+    surface = surface_of(picture)
     if surface is None:
         return False
     camera = next((item for item in picture.scene if item.name == "cameras/estimate"), None)
-    centre, radius_m = _centre_and_radius(surface)
+    centre, radius_m = centre_and_radius(surface)
     apart_m = [float(np.linalg.norm(centre - position))]
     if isinstance(camera, Segments) and len(camera.points):
         apart_m.append(_apart(camera, position))
     return min(apart_m) < CLOSE * radius_m
-
-
-def _surface(picture: Picture) -> Mesh | None:
-    """The surface of the sphere; None if the picture has none."""
-    return next((item for item in picture.scene if isinstance(item, Mesh) and item.name == "sphere/surface"), None)
-
-
-@lru_cache(maxsize=8)
-def _centre_and_radius(surface: Mesh) -> tuple[FloatArray, float]:
-    """Centre (3,) and radius, m, of the sphere."""
-    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
-    return (low + high) / 2, float(high[0] - low[0]) / 2
 
 
 def _apart(camera: Segments, position: FloatArray) -> float:
@@ -313,7 +242,7 @@ def find(name: str, picture: Picture, aspect: float, walls: Walls | None = None)
     """
     if name == INSIDE:
         return _inside(picture)
-    subject = _subject(name, picture)
+    subject = subject_of(name, picture)
     return _clear(name, picture, subject, subject, aspect, walls)
 
 
@@ -330,7 +259,7 @@ def _clear(
     fitted = (positions, targets) if clear is subject else _fits(clear, directions, aspect)
     hidden = _in_the_way(*fitted, points.positions) + 0.5 * np.arange(len(directions))
     if walls is not None or name == "Balls":
-        looked_at, surface = _sample(subject), _surface(picture)
+        looked_at, surface = _sample(subject), surface_of(picture)
         if walls is not None:
             hidden += len(points.positions) * np.array([walls.blocked(position, looked_at) for position in positions])
         if name == "Balls" and surface is not None:
@@ -349,7 +278,7 @@ def _sample(subject: FloatArray) -> FloatArray:
 def _behind(surface: Mesh, positions: FloatArray, targets: FloatArray) -> NDArray[np.bool_]:
     """Whether the sphere hides targets (K, 3) from positions (D, 3), as (D, K)."""
     sight = targets - positions[:, None]
-    centre, radius_m = _centre_and_radius(surface)
+    centre, radius_m = centre_and_radius(surface)
     to_centre = (centre - positions)[:, None]
     share = np.clip(np.sum(to_centre * sight, axis=2) / np.sum(sight**2, axis=2), 0.0, 1.0)
     return np.linalg.norm(share[..., None] * sight - to_centre, axis=2) < radius_m
@@ -358,9 +287,9 @@ def _behind(surface: Mesh, positions: FloatArray, targets: FloatArray) -> NDArra
 def _inside(picture: Picture) -> Viewpoint:
     """The view along the camera's axis from the camera or, while its position is unknown, from the sphere's centre."""
     items = {item.name: item for item in picture.scene}
-    surface = _surface(picture)
+    surface = surface_of(picture)
     assert surface is not None
-    centre, radius_m = _centre_and_radius(surface)
+    centre, radius_m = centre_and_radius(surface)
     axis = _axis(items)
     camera = items.get("cameras/estimate")
     if isinstance(camera, Segments):
@@ -439,65 +368,3 @@ def _in_the_way(standing: FloatArray, targets: FloatArray, positions: FloatArray
     away = np.linalg.norm(positions - standing[:, None], axis=2)
     before = (depth > 0) & (depth < 0.9 * distance) & (depth > np.cos(FIELD_OF_VIEW_RAD / 2) * away)
     return np.sum(before * (distance / np.maximum(depth, 1e-3)) ** 2, axis=1)
-
-
-SMALL_WALK, WALK_ROOM = 1.0 / 3.0, 0.4
-"""If photographs were taken in a part of the map that is smaller than this share of it, the view from above and that of
-the outcome show that part, with room around it, as a share of its size."""
-
-
-def _walk(picture: Picture) -> FloatArray | None:
-    """Points (K, 3) around where the photographs of a map and the query were taken, if that is a small part of the map;
-    None without it or without a position of the query."""
-    items = {item.name: item for item in picture.scene}
-    points, camera = items["map/points"], items.get("cameras/estimate")
-    assert isinstance(points, Points)
-    route = _route(picture)
-    if not route or not isinstance(camera, Segments):  # without a position, the sphere is elsewhere
-        return None
-    taken = np.vstack([*route, camera.points[:1, 0]])
-    extent_m, whole_m = (float(np.ptp(places, axis=0).max()) for places in (taken, dense_points(points.positions)))
-    if not 0.0 < extent_m < SMALL_WALK * whole_m:
-        return None
-    return np.vstack([taken - WALK_ROOM * extent_m, taken + WALK_ROOM * extent_m])
-
-
-def _walk_at_end(picture: Picture) -> FloatArray | None:
-    """``_walk`` at the last step."""
-    return _walk(picture) if picture.step.stage == LAST else None
-
-
-def _route(picture: Picture) -> list[FloatArray]:
-    """Where the queries of a sequence and the references were taken: arrays (K, 3)."""
-    return [
-        item.positions
-        for item in picture.scene
-        if isinstance(item, Points) and (item.layer == "trajectory" or item.name == REFERENCES)
-    ]
-
-
-def _subject(name: str, picture: Picture) -> FloatArray:
-    """Points (K, 3) that a view must hold."""
-    items = {item.name: item for item in picture.scene}
-    if name == "Sphere":
-        return _sphere(items["sphere/surface"], any(item.layer == "yaw ring" for item in picture.scene))
-    if name == "Balls" and picture.focus.view == "Balls":
-        return picture.focus.points
-    points, surface = items["map/points"], items["sphere/surface"]
-    assert isinstance(points, Points) and isinstance(surface, Mesh)
-    lines = [
-        item.points.reshape(-1, 3)
-        for item in picture.scene
-        if isinstance(item, Segments) and item.layer in ("cameras", "scale bar")
-    ]
-    walk = _walk(picture) if name == "Above" else None
-    if walk is not None:
-        return walk
-    return np.vstack([dense_points(points.positions), surface.vertices, *lines, *_route(picture)])
-
-
-def _sphere(surface: object, ring: bool) -> FloatArray:
-    """The sphere with some room, or the ring around it."""
-    assert isinstance(surface, Mesh)
-    centre, radius_m = _centre_and_radius(surface)
-    return circle(centre, RING_ROOM * radius_m) if ring else sphere_box(centre, SPHERE_ROOM * radius_m)
