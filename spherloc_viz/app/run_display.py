@@ -22,14 +22,16 @@ from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.plots.graph_view import CLIQUE_STEP
 from spherloc_viz.app.stage.canvas import Canvas, panel_widths_px, text_scale
+from spherloc_viz.app.stage.subjects import walk_at_end
 from spherloc_viz.app.text import diagnosis_html, hidden_html, key_step_html, status_html, summary_of
 from spherloc_viz.app.web.touch import Touch, Touches, pixels_of
 from spherloc_viz.app.web.viser_internals import changes_of, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.layers.key_step import key_step
 from spherloc_viz.layers.outcome import early_table
-from spherloc_viz.layers.point_cloud import cloud_items
+from spherloc_viz.layers.point_cloud import cloud_items, with_few_rays
 from spherloc_viz.layers.primitives import Label, Picture, SceneItem, Segments, Table
+from spherloc_viz.layers.scale_bar import scale_bar
 from spherloc_viz.layers.selection import with_selection
 from spherloc_viz.layers.where_taken import where_taken
 from spherloc_viz.layers.withheld import ANSWERS, OUTCOME, untold
@@ -194,6 +196,8 @@ class RunDisplay:
         alternative = None if diagnosis is None else diagnosis.alternative_cam_from_map
         if last and alternative is not None:
             picture = with_alternative(picture, trace, alternative)
+        if last and self._photographs(run) is not None:
+            picture = with_few_rays(picture)
         drawn = with_selection(picture, trace, selected)
         beside = controls.items(known, hidden)
         names = {item.name for item in beside if isinstance(item, Label) and item.layer == "trajectory"}
@@ -203,6 +207,10 @@ class RunDisplay:
         if last and not names:
             scene += self._query_name(run, drawn)
         drawn = replace(drawn, scene=tuple(item for item in scene if item.name not in left_out))
+        walk = walk_at_end(drawn) if last else None
+        if walk is not None:
+            box = np.stack([walk.min(axis=0), walk.max(axis=0)])
+            drawn = replace(drawn, scene=(*drawn.scene, *scale_bar("walk", box, run.trace.problem.metric)))
         self._shown = known, mesh, drawn
         with self._client.atomic():
             self._follow_theme()
@@ -230,15 +238,18 @@ class RunDisplay:
     def _opens_photographs(self, run: Run) -> bool:
         """Whether this is the first run on the page of a map of photographs, of which is asked first where they were
         taken."""
-        label = run.request.scene.scene
-        scene = self._scene_of(label)
-        known = self._shown is not None and self._shown[0].request.scene.scene == label
-        return not known and scene is not None and scene.cloud is not None
+        known = self._shown is not None and self._shown[0].request.scene.scene == run.request.scene.scene
+        return not known and self._photographs(run) is not None
+
+    def _photographs(self, run: Run) -> MapScene | None:
+        """The run's scene, if it is a map of photographs."""
+        scene = self._scene_of(run.request.scene.scene)
+        return None if scene is None or scene.cloud is None else scene
 
     def _where(self, run: Run) -> str:
         """Where the query of a map of photographs was taken."""
-        scene = self._scene_of(run.request.scene.scene)
-        return "" if scene is None or scene.cloud is None else where_taken(scene, run.trace)
+        scene = self._photographs(run)
+        return "" if scene is None else where_taken(scene, run.trace)
 
     def _outcome_of(self, trace: Trace, judged: Judgement | None) -> Table:
         """The table of the outcome, which is the same at all steps."""
@@ -258,9 +269,9 @@ class RunDisplay:
 
     def _query_name(self, run: Run, picture: Picture) -> tuple[SceneItem, ...]:
         """The name of the query of a map of photographs, over its camera."""
-        scene, query = self._scene_of(run.request.scene.scene), run.request.scene.query
+        scene, query = self._photographs(run), run.request.scene.query
         camera = next((item for item in picture.scene if item.name == "cameras/estimate"), None)
-        if scene is None or scene.cloud is None or query is None or not isinstance(camera, Segments):
+        if scene is None or query is None or not isinstance(camera, Segments):
             return ()
         (x, y, z), top = camera.points[0, 0], float(camera.points[..., 1].min())  # y points down
         return (Label("cloud/query", "cameras", np.array([x, top - 0.2 * (y - top), z]), query),)

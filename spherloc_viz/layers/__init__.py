@@ -30,10 +30,11 @@ from spherloc_viz.layers import (
     withheld,
     yaw,
 )
+from spherloc_viz.layers.camera_shape import camera
 from spherloc_viz.layers.frame import Plan, RunView, focus_of
 from spherloc_viz.layers.primitives import Chart, Graph, Picture, Step, StepHeading
 from spherloc_viz.layers.query_image import modified
-from spherloc_viz.layers.scene import base_items, camera
+from spherloc_viz.layers.scene import base_items
 
 STAGES: dict[type[Stage], tuple[str, Callable[[RunView, Any], list[Plan]]]] = {
     DecisionStage: ("Choice", ransac.decision_plans),

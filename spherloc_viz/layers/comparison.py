@@ -13,10 +13,10 @@ from spherloc.refine import residuals_px
 from spherloc.trace import Certificate, ConsensusStage, Trace, YawStage
 from spherloc.types import FloatArray
 from spherloc_viz import style
+from spherloc_viz.layers.camera_shape import camera
 from spherloc_viz.layers.frame import RunView, length_text, one_color
 from spherloc_viz.layers.outcome import is_knowable
 from spherloc_viz.layers.primitives import Chart, Curve, Label, SceneItem, Segments, Table
-from spherloc_viz.layers.scene import camera
 
 PALETTE: tuple[style.RGB, ...] = (
     (150, 205, 20),

@@ -11,10 +11,10 @@ from spherloc.trace import ConsensusStage, PositionStage
 from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
+from spherloc_viz.layers.camera_shape import camera
 from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, one_color, sphere_box
 from spherloc_viz.layers.graph_nodes import graph_at, match_nodes
 from spherloc_viz.layers.primitives import Chart, Curve, Focus, Graph, Nodes, SceneItem, Segments, Table
-from spherloc_viz.layers.scene import camera
 
 PEAKS = 16
 """Largest number of peaks of the bound that have a step."""

@@ -14,39 +14,18 @@ from spherloc.geometry import camera_centre
 from spherloc.problem import Problem
 from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
+from spherloc_viz.layers.camera_shape import CORNERS, camera
 from spherloc_viz.layers.frame import Frame, RunView, icosphere, one_color
 from spherloc_viz.layers.point_cloud import MAX_NAMED
 from spherloc_viz.layers.primitives import Label, Mesh, Points, SceneItem, Segments, Textured
 from spherloc_viz.layers.query_image import modified, sphere_texture
+from spherloc_viz.layers.scale_bar import round_length, scale_bar
 from spherloc_viz.layers.uncertainty import error_items, is_close_up
 
-BAR_SHARE = 0.25
-"""Largest length of the scale bar, as a share of the map's width."""
-BAR_TICK = 0.04
-"""Height of its marks, and of the bar above the ground, as a share of the bar: a kerb must not hide it."""
-BAR_INSET = 0.12
-"""Its distance from the near side of the map, as a share of the map's depth: at the side itself may stand a wall."""
 CELL_SHARE, GROUND_SHARE = 0.2, 0.9
 """Largest side of a cell of the ground, and the ground's radius, as shares of the map's width."""
 RIM = 72
 """Number of straight pieces of the ground's edge."""
-
-
-def scale_bar(view: RunView) -> list[SceneItem]:
-    """The bar with its length, in front of the map as the overview shows it."""
-    low, high = view.dense_box
-    length = round_length(BAR_SHARE * max(float((high - low)[[0, 2]].max()), 1e-3))
-    near = low[2] + BAR_INSET * (high - low)[2]
-    start = np.array([0.5 * (low + high)[0] - 0.5 * length, high[1] - BAR_TICK * length, near])
-    along, tick = np.array([length, 0.0, 0.0]), np.array([0.0, -BAR_TICK * length, 0.0])
-    marks = start + np.array([0.0, 0.5, 1.0])[:, None] * along
-    heights = np.array([1.0, 0.6, 1.0])[:, None] * tick
-    lines = np.concatenate([[[start, start + along]], np.stack([marks, marks + heights], axis=1)])
-    below = start + 0.5 * along - 1.5 * tick
-    return [
-        Segments("scale/bar", "scale bar", lines, one_color(style.SCALE, len(lines)), 3.0),
-        Label("scale/length", "scale bar", below, view.length_text(length)),
-    ]
 
 
 def ground(view: RunView) -> list[SceneItem]:
@@ -76,12 +55,6 @@ def ground(view: RunView) -> list[SceneItem]:
     ]
 
 
-def round_length(most: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten that is not larger."""
-    power = 10.0 ** np.floor(np.log10(most))
-    return max(float(step * power) for step in (0.5, 1.0, 2.0, 5.0) if step * power <= most * (1.0 + 1e-9))
-
-
 CAMERA = 1.9
 """Size of a camera, in sphere radii."""
 GHOST_AWAY = 0.3
@@ -107,7 +80,7 @@ def base_items(view: RunView, frame: Frame) -> tuple[SceneItem, ...]:
         Points("map/points", "map", view.points, frame.colors, 0.07 * view.dot_m, view.numbers),
         *_sphere(view, frame),
         *view.kept("located", (pose, frame.located, is_close_up(frame)), lambda: _located(view, frame)),
-        *view.of_map("scale bar", lambda: scale_bar(view)),
+        *view.of_map("scale bar", lambda: scale_bar("scale", view.dense_box, view.metric)),
         *view.of_map("ground", lambda: ground(view)),
     )
 
@@ -203,20 +176,6 @@ def _seen(camera: Camera, camera_turn: FloatArray) -> ByteArray:
     return np.where(valid & in_image(camera, pixels), 255, 0).astype(np.uint8).reshape(rows.shape)
 
 
-_CORNERS = np.array([[-0.5, -0.4, 0.7], [0.5, -0.4, 0.7], [0.5, 0.4, 0.7], [-0.5, 0.4, 0.7]])
-"""Corners of the opening of a camera of size 1."""
-_ROOF = np.array([0.0, -0.62, 0.7])
-"""Tip of the roof above the upper edge of that opening."""
-_EDGES = np.concatenate(
-    [
-        np.stack([np.zeros((4, 3)), _CORNERS], axis=1),
-        np.stack([_CORNERS, np.roll(_CORNERS, -1, axis=0)], axis=1),
-        [[_CORNERS[0], _ROOF], [_ROOF, _CORNERS[1]]],
-    ]
-)
-"""Lines (10, 2, 3) of a camera of size 1."""
-
-
 def _ghost(view: RunView, frame: Frame) -> list[Mesh]:
     """The true camera's translucent body; empty if the estimated camera is too near."""
     if view.truth is None:
@@ -228,16 +187,9 @@ def _ghost(view: RunView, frame: Frame) -> list[Mesh]:
 
 
 def _body(cam_from_map: FloatArray, size_m: float) -> Mesh:
-    corners = camera_centre(cam_from_map) + size_m * np.vstack([np.zeros(3), _CORNERS]) @ cam_from_map[:, :3]
+    corners = camera_centre(cam_from_map) + size_m * np.vstack([np.zeros(3), CORNERS]) @ cam_from_map[:, :3]
     faces = np.array([[k % 4 + 1, k, 0] for k in range(1, 5)])
     return Mesh("cameras/ghost", "cameras", corners, np.vstack([faces, faces[:, ::-1]]), style.TRUTH, 0.16)
-
-
-def camera(name: str, cam_from_map: FloatArray, size_m: float, color: style.RGB, width_px: float) -> Segments:
-    """An open pyramid around the viewing direction, its upper edge marked by a roof."""
-    centre, rotation = camera_centre(cam_from_map), cam_from_map[:, :3]
-    ends = centre + size_m * _EDGES @ rotation
-    return Segments(name, "cameras", ends, one_color(color, len(ends)), width_px)
 
 
 DOT_SHARE = 0.06

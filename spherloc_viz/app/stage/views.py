@@ -29,6 +29,8 @@ WIDE, HIGH = np.array([0.5, 0.0]), np.array([0.6, 1.4])
 """Half a label's width and height, in widths of a letter: per letter, and in addition."""
 BESIDE = ("ground", "scale bar")
 """Layers whose labels are the same at every step."""
+YIELDING = ("uncertainty", "trajectory", "point cloud", *BESIDE)
+"""Layers whose labels are hidden where they would lie over others; those of a later one also by those of an earlier."""
 NEAR = 0.6
 """Largest distance of a step's labels from its subject, as a share of the subject's size."""
 ROUNDS = 4
@@ -132,14 +134,14 @@ def cut(picture: Picture, view: Viewpoint, aspect: float, letter: float) -> froz
     labels = [item for item in picture.scene if isinstance(item, Label)]
     if not labels:
         return frozenset()
-    labels.sort(key=lambda label: label.layer in BESIDE)
+    labels.sort(key=lambda label: 1 + YIELDING.index(label.layer) if label.layer in YIELDING else 0)
     seen = projected(view, np.array([label.position for label in labels])) / np.tan(view.field_of_view_rad / 2)
     halves = _half_sizes(labels, letter)
     within = (np.abs(seen) + halves <= np.array([aspect, 1.0]) + ROUNDING).all(axis=1)
     shown: list[int] = []
     for k in np.flatnonzero(within).tolist():
-        beside = labels[k].layer in BESIDE
-        if not (beside and (np.abs(seen[k] - seen[shown]) < halves[k] + halves[shown]).all(axis=1).any()):
+        yields = labels[k].layer in YIELDING
+        if not (yields and (np.abs(seen[k] - seen[shown]) < halves[k] + halves[shown]).all(axis=1).any()):
             shown.append(k)
     return frozenset(label.name for k, label in enumerate(labels) if k not in shown)
 
