@@ -56,17 +56,18 @@ def test_bars_are_as_high_as_the_counts(run: Trace) -> None:
     marked = np.zeros(len(run.problem), dtype=bool)
     marked[[3, 5, 8, 13]] = True
     for shown in residuals.histograms:
-        root = ElementTree.fromstring(histogram_svg(shown, residuals.names, marked))
-        total = shown.right + shown.wrong
+        root = ElementTree.fromstring(histogram_svg(shown, marked))
+        total = shown.inliers + shown.outliers
         y = Scale(0.0, 1.08 * total.max(), FOOT_PX, 20.0)
-        right, wrong, chosen = (boxes(root, name) for name in ("right", "wrong", "chosen"))
-        assert [top for *_, top in right] == pytest.approx([y.at(n) for n in shown.right if n], abs=0.06)
-        assert [top for *_, top in wrong] == pytest.approx(
-            [y.at(n) for n, w in zip(total, shown.wrong, strict=True) if w], abs=0.06
-        )
-        assert [foot for _, foot, _ in wrong] == pytest.approx(
-            [y.at(n) for n, w in zip(shown.right, shown.wrong, strict=True) if w], abs=0.06
-        )
+        for name, low, high in (
+            ("inliers", np.zeros_like(total), shown.inliers),
+            ("outliers", shown.inliers, total),
+            ("wrongly", shown.inliers - shown.wrongly_kept, shown.inliers + shown.wrongly_rejected),
+        ):
+            drawn, there = boxes(root, name), high > low
+            assert [top for *_, top in drawn] == pytest.approx([y.at(n) for n in high[there]], abs=0.06)
+            assert [foot for _, foot, _ in drawn] == pytest.approx([y.at(n) for n in low[there]], abs=0.06)
+        chosen = boxes(root, "chosen")
         counts = np.bincount(shown.bin[marked], minlength=len(total))
         assert [top for *_, top in chosen] == pytest.approx([y.at(n) for n in counts if n], abs=0.06)
         pressable = [rect for rect in root.iter(f"{SVG}rect") if "data-touch" in rect.attrib]
@@ -79,7 +80,7 @@ def test_bars_are_as_high_as_the_counts(run: Trace) -> None:
 def test_the_bound_is_where_the_axis_says(run: Trace) -> None:
     residuals = residuals_of(run)
     assert residuals is not None
-    root = ElementTree.fromstring(histogram_svg(residuals.histograms[0], residuals.names, np.zeros(100, dtype=bool)))
+    root = ElementTree.fromstring(histogram_svg(residuals.histograms[0], np.zeros(100, dtype=bool)))
     line = next(p for p in root.iter(f"{SVG}path") if "stroke-dasharray" in p.attrib).attrib["d"]
     ticks = {item.text: float(item.attrib["x"]) for item in root.iter(f"{SVG}text")}
     # 8 px lies at log10(8) of the way from 1 to 10.
@@ -98,7 +99,7 @@ def test_a_press_on_a_bar_selects_the_matches_in_it(server: viser.ViserServer, r
     residuals = residuals_of(run)
     assert residuals is not None
     for unit, shown in zip(("px", "deg"), residuals.histograms, strict=True):
-        for place in np.flatnonzero(shown.right + shown.wrong):
+        for place in np.flatnonzero(shown.inliers + shown.outliers):
             assert f'data-touch="select-bin:{unit}:{place}"' in view._html.content
             touches.deliver(Touch("select-bin", f"{unit}:{place}", 0, 0, 0, 0, False))
             assert chosen[-1] == tuple(np.flatnonzero(shown.bin == place))

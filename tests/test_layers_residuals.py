@@ -45,16 +45,22 @@ def test_residuals_are_the_distances_in_the_image(run: Trace) -> None:
 
 def test_every_match_is_in_one_bin_of_each_histogram(run: Trace) -> None:
     residuals = residuals_of(run)
-    assert residuals is not None and residuals.judged == "by the truth"
+    assert residuals is not None and residuals.truth_known
     truth = run.problem.truth_inliers
     assert truth is not None
     for shown, values in zip(residuals.histograms, (residuals.px, residuals.deg), strict=True):
         edges = np.concatenate([[0.0], shown.edges, [np.inf]])
         held = np.minimum(values, 1e300)
         assert np.all(held >= edges[shown.bin]) and np.all(held < edges[shown.bin + 1])
-        assert np.array_equal(shown.right, np.histogram(held[truth], edges)[0])
-        assert np.array_equal(shown.wrong, np.histogram(held[~truth], edges)[0])
-        assert len(bin_words(shown.unit)) == len(shown.right) == 4 * BINS_A_DECADE + 2
+        kept = run.inlier_mask
+        for counts, members in (
+            (shown.inliers, kept),
+            (shown.outliers, ~kept),
+            (shown.wrongly_kept, kept & ~truth),
+            (shown.wrongly_rejected, ~kept & truth),
+        ):
+            assert np.array_equal(counts, np.histogram(held[members], edges)[0])
+        assert len(bin_words(shown.unit)) == len(shown.inliers) == 4 * BINS_A_DECADE + 2
     assert residuals.histograms[0].bound[1] == pytest.approx(run.options.bound_px)
 
 
@@ -76,9 +82,10 @@ def test_the_bound_shown_is_the_one_that_chose_the_inliers(scene_of: SceneOf) ->
 
 def test_the_edges_of_bins_belong_to_the_bin_above() -> None:
     values = np.array([0.0, 0.1, 1.0, 999.0, 1000.0, np.inf, np.nan])
-    shown = histogram("px", values, np.array([True] * 3 + [False] * 4), (3.0, 3.0, 3.0))
+    kept = np.array([True] * 3 + [False] * 4)
+    shown = histogram("px", values, (kept, kept), (3.0, 3.0, 3.0))
     assert shown.bin.tolist() == [0, 1, 1 + BINS_A_DECADE, 24, 25, 25, 25]
-    assert shown.right.sum() == 3 and shown.wrong[25] == 3
+    assert shown.inliers.sum() == 3 and shown.outliers[25] == 3
     words = bin_words("px")
     assert words[0] == "less than 0.1 px" and words[7] == "1 to 1.5 px"
     assert words[-1] == "1000 px or more, or more than 90° off"
@@ -95,14 +102,16 @@ def test_pixels_that_the_camera_cannot_see_are_counted(scene_of: SceneOf) -> Non
     assert residuals is not None and residuals.blind == 4
     assert np.isinf(residuals.px[:4]).all() and np.isinf(residuals.deg[:4]).all()
     for shown in residuals.histograms:
-        assert (shown.bin[:4] == len(shown.right) - 1).all() and (shown.right + shown.wrong).sum() == 60
+        assert (shown.bin[:4] == len(shown.inliers) - 1).all() and (shown.inliers + shown.outliers).sum() == 60
 
 
-def test_without_truth_the_run_itself_is_the_judge(run: Trace) -> None:
+def test_without_truth_nothing_is_called_wrong(run: Trace) -> None:
     problem = replace(run.problem, truth_inliers=None, truth_cam_from_map=None)
     residuals = residuals_of(replace(run, problem=problem))
-    assert residuals is not None and residuals.judged == "by this run's inliers"
-    assert residuals.histograms[0].right.sum() == np.count_nonzero(run.inlier_mask)
+    assert residuals is not None and not residuals.truth_known
+    for shown in residuals.histograms:
+        assert shown.inliers.sum() == np.count_nonzero(run.inlier_mask)
+        assert not shown.wrongly_kept.any() and not shown.wrongly_rejected.any()
     rows = scores_table(replace(run, problem=problem)).rows
     assert [row[0] for row in rows] == ["reported inliers"]
 

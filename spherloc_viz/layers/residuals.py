@@ -6,7 +6,6 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds, bounds_of
 from spherloc.geometry import transform
@@ -16,7 +15,6 @@ from spherloc.refine import residuals_px
 from spherloc.trace import RansacStage, Trace
 from spherloc.types import BoolArray, FloatArray, IntArray
 from spherloc_viz.layers.primitives import Table
-from spherloc_viz.layers.yaw_story import right_ones
 
 Unit = Literal["px", "deg"]
 
@@ -36,15 +34,29 @@ class Histogram:
     """(B - 1,) edges between the bins."""
     bin: IntArray
     """(N,) bin of every match."""
-    right: IntArray
-    """(B,) number of right matches."""
-    wrong: IntArray
-    """(B,) number of wrong matches."""
+    inliers: IntArray
+    """(B,) number of the run's inliers."""
+    outliers: IntArray
+    """(B,) number of its outliers."""
+    wrongly_kept: IntArray
+    """(B,) how many of the inliers are wrong by the truth; none if that is unknown."""
+    wrongly_rejected: IntArray
+    """(B,) how many of the outliers are right by the truth; none if that is unknown."""
     bound: tuple[float, float, float]
     """The smallest, the median and the largest bound by which the run's inliers were chosen: one number where the image
     stretches alike and gravity is exact."""
     widened: bool = False
     """Whether these bounds allow for gravity's error, besides the noise."""
+
+    @property
+    def right(self) -> IntArray:
+        """(B,) number of right matches; the run's inliers where the truth is unknown."""
+        return self.inliers - self.wrongly_kept + self.wrongly_rejected
+
+    @property
+    def wrong(self) -> IntArray:
+        """(B,) number of the others."""
+        return self.inliers + self.outliers - self.right
 
 
 @lru_cache(maxsize=4)
@@ -72,10 +84,8 @@ class Residuals:
     """(N,) angles between the bearing and the direction to the point, degrees; inf where there is no bearing."""
     histograms: tuple[Histogram, Histogram]
     """The histograms in px and in degrees."""
-    judged: str
-    """The source that says which matches are right: "by the truth" or "by this run's inliers"."""
-    names: tuple[str, str]
-    """What the right and the wrong ones are called: the run's inliers are not said to be right."""
+    truth_known: bool
+    """Whether the truth tells which matches are right."""
     blind: int
     """Number of matches whose pixel has no bearing."""
 
@@ -119,7 +129,7 @@ def residuals_of(trace: Trace) -> Residuals | None:
     px, deg = np.full(len(problem), np.inf), np.full(len(problem), np.inf)
     px[aligned.index] = residuals_px(aligned, aligned.align_pose(trace.cam_from_map))
     deg[aligned.index] = _angles_deg(problem.bearings, transform(trace.cam_from_map, problem.points))[aligned.index]
-    right, judged = right_ones(trace)
+    kept, right = trace.inlier_mask, problem.truth_inliers
     bounds = run_bounds(trace)
     limits_px = verdicts(trace).limit_px[aligned.index]
     # Both bounds are this wide, or neither: gravity's error is added to the noise in px and in radians.
@@ -127,11 +137,10 @@ def residuals_of(trace: Trace) -> Residuals | None:
     level = replace(aligned, gravity_bound_rad=0.0)
     limits_rad = bounds.radians if widened else bounds_of(level, bounds.noise_px).radians
     histograms = (
-        histogram("px", px, right, _middle(limits_px), widened),
-        histogram("deg", deg, right, _middle(np.degrees(limits_rad)), widened),
+        histogram("px", px, (kept, right), _middle(limits_px), widened),
+        histogram("deg", deg, (kept, right), _middle(np.degrees(limits_rad)), widened),
     )
-    names = ("inliers", "outliers") if problem.truth_inliers is None else ("right", "wrong")
-    return Residuals(px, deg, histograms, judged, names, int(np.count_nonzero(~problem.usable)))
+    return Residuals(px, deg, histograms, right is not None, int(np.count_nonzero(~problem.usable)))
 
 
 def _middle(values: FloatArray) -> tuple[float, float, float]:
@@ -151,17 +160,24 @@ def _angles_deg(bearings: FloatArray, points: FloatArray) -> FloatArray:
 def histogram(
     unit: Unit,
     values: FloatArray,
-    right: NDArray[np.bool_],
+    judged: tuple[BoolArray, BoolArray | None],
     bound: tuple[float, float, float],
     widened: bool = False,
 ) -> Histogram:
-    """Histogram of values (N,) of 0 or more, in bins of equal ratios; values that are not finite are in the last
-    bin."""
+    """Histogram of values (N,) of 0 or more, in bins of equal ratios; values that are not finite are in the last bin.
+
+    ``judged`` are masks (N,) of the run's inliers and of the right matches, this one None if they are unknown.
+    """
     edges = edges_of(unit)
     place = np.searchsorted(edges, np.nan_to_num(values, nan=np.inf), "right").astype(np.int64)
-    count = len(edges) + 1
-    of_right = np.bincount(place[right], minlength=count)
-    return Histogram(unit, edges, place, of_right, np.bincount(place, minlength=count) - of_right, bound, widened)
+    kept, right = judged[0], judged[0] if judged[1] is None else judged[1]
+
+    def count(some: BoolArray) -> IntArray:
+        return np.bincount(place[some], minlength=len(edges) + 1)
+
+    return Histogram(
+        unit, edges, place, count(kept), count(~kept), count(kept & ~right), count(~kept & right), bound, widened
+    )
 
 
 def scores_table(trace: Trace) -> Table:

@@ -25,6 +25,8 @@ TRUTH = "ring/truth"
 """Name of the line of the true yaw."""
 HIDES_RAD = np.radians(4.0)
 """Least angle between two lines that can be told apart."""
+PIECE_RAD = np.radians(2.5)
+"""Largest angle between the lines that fill a piece of the ring."""
 DEGREES = 360
 """Number of points of the outline."""
 GOLDEN = 0.6180339887498949
@@ -65,6 +67,16 @@ def loop(name: str, layer: str, line: FloatArray, color: style.RGB) -> Segments:
 def outline(name: str, line: FloatArray, color: style.RGB) -> Segments:
     """A closed line of the ring through the points (K, 3)."""
     return loop(name, "yaw ring", line, color)
+
+
+def pieces(name: str, view: RunView, lo_rad: FloatArray, hi_rad: FloatArray) -> Segments:
+    """The pieces of the ring from yaws (A,) to yaws (A,), and lines from the sphere to them."""
+    yaws = [np.linspace(lo, hi, 2 + int((hi - lo) / PIECE_RAD)) for lo, hi in zip(lo_rad, hi_rad, strict=True)]
+    outer = [FOOT * directions(some) for some in yaws]
+    along = np.concatenate([np.stack([some[:-1], some[1:]], axis=1) for some in outer])
+    across = np.concatenate([np.stack([some / FOOT, some], axis=1) for some in outer])
+    lines = view.middle + view.sphere_m * np.concatenate([along, across])
+    return Segments(name, "yaw ring", lines, one_color(style.SAMPLE, len(lines)), 2.0)
 
 
 def bars(name: str, feet: FloatArray, tops: FloatArray, colors: ByteArray) -> Segments:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from spherloc.consensus.yaw_arcs import YawConsensus, deepest_yaw
 from spherloc.geometry import wrap_angle, yaw_rotation
 from spherloc.trace import YawStage
-from spherloc.types import FloatArray, IntArray
+from spherloc.types import BoolArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, one_color, ring_focus
-from spherloc_viz.layers.primitives import Chart, SceneItem, Segments, true_minus
+from spherloc_viz.layers.primitives import Chart, Focus, SceneItem, Segments, true_minus
 
 INNER, OUTER = 1.3, 1.95
 """Radii of the band of arcs, in sphere radii."""
@@ -25,6 +25,8 @@ FEWEST_TRACKS = 24
 """Least number of tracks of the band; it has more if more arcs are drawn over one yaw."""
 EXAMPLE_RAD = np.radians(15.0)
 """Preferred width of the arc that serves as an example."""
+RAYS_SEEN = 4.5
+"""Largest part of the rays of a pair that is framed, in sphere radii."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +34,8 @@ class StageArcs:
     """A yaw stage and what several of its frames need, computed when it is first asked for. A arcs."""
 
     stage: YawStage
+    inliers: BoolArray
+    """Mask (N,) of the run's inliers; all false if they are withheld."""
 
     def __len__(self) -> int:
         return len(self.stage.lo_rad)
@@ -64,6 +68,19 @@ class StageArcs:
         several = int(np.count_nonzero(same[1:] & ~same[:-1]))
         return pairs - several, several
 
+    def middle_deg(self, chosen: IntArray) -> float:
+        """The yaw, degrees, around which a step that shows the arcs ``chosen`` is about: that which most of them cover,
+        or of one pair the middle of its arc over the estimated yaw."""
+        if np.array_equal(chosen, self.example):
+            k = self.example_in_clique
+            return float(np.degrees(0.5 * (self.stage.lo_rad[k] + self.stage.hi_rad[k])))
+        return float(np.degrees(self.overlap_of(chosen).yaw_rad))
+
+    @property
+    def two_at_most(self) -> bool:
+        """Whether no pair has a third arc: a root has two where a point passes behind the camera between them."""
+        return not bool(np.any(self._continues[1:] & self._continues[:-1]))
+
     @property
     def example_in_clique(self) -> int:
         """The arc of the example over the estimated yaw."""
@@ -72,10 +89,14 @@ class StageArcs:
     @cached_property
     def example(self) -> IntArray:
         """The arcs of one pair with an arc over the estimated yaw, or of any pair if that is withheld: of such pairs,
-        with two arcs if there are any, the one whose arc there is closest to ``EXAMPLE_RAD`` in width."""
+        of two inliers and with two arcs if there are any, the one whose arc there is closest to ``EXAMPLE_RAD`` in
+        width."""
         arcs, same = self.stage.clique.astype(np.int64), self._continues
         if not len(arcs):
             arcs = np.arange(len(self))
+        right = self.inliers[self.stage.pairs[arcs]].all(axis=1)
+        if right.any():
+            arcs = arcs[right]
         several = same[arcs] | np.append(same[1:], False)[arcs]
         if several.any():
             arcs = arcs[several]
@@ -194,7 +215,7 @@ def _pair(view: RunView, arcs: StageArcs) -> Frame:
     lo, hi = np.degrees(stage.lo_rad[k]), np.degrees(stage.hi_rad[k])
     also = ", and a second arc" if len(example) > 1 else ""
     d1, d2, d3 = pair_roots(view, first, second).wave
-    items = _items(view, arcs, np.array([k]), (first, second))
+    items = _items(view, arcs, example, (first, second))
     return Frame(
         f"Matches {first} and {second} can both be right only where the line between their points turns into the plane "
         f"of their bearings, and that fixes the yaw. With {view.trace.options.bound_px:.3g} px of noise it is an arc "
@@ -208,7 +229,7 @@ def _pair(view: RunView, arcs: StageArcs) -> Frame:
                 "ring/name", view, 0.5 * float(stage.lo_rad[k] + stage.hi_rad[k]), "arc: the yaws this pair allows"
             ),
         ),
-        focus=ring_focus(view, view.points[[first, second]], *ring.true_ends(items)),
+        focus=_focus(view, (first, second), items),
     )
 
 
@@ -218,18 +239,26 @@ def _roots(view: RunView, arcs: StageArcs) -> Frame:
     first, second = (int(number) for number in stage.pairs[example[0]])
     found = pair_roots(view, first, second)
     one, several = arcs.pair_counts
-    none = stage.pairs_total - one - several
+    none, more = stage.pairs_total - one - several, "" if arcs.two_at_most else " or more"
     other = example[np.argmin(arcs.in_clique[example])]
     items = _items(view, arcs, example, (first, second))
     return Frame(
-        f"{_why(found, len(example))} Of all {stage.pairs_total:,} pairs, {several:,} have two arcs or more, {one:,} "
+        f"{_why(found, len(example))} Of all {stage.pairs_total:,} pairs, {several:,} have two arcs{more}, {one:,} "
         f"have one, and {none:,} have none.",
         "θ = atan2(d2, d1) ± arccos(−d3 / √(d1² + d2²))   (Eq. 22-23)",
         *_shown(view, (first, second), 0.5 * float(stage.lo_rad[other] + stage.hi_rad[other])),
         note=stage.rule,
         items=items,
-        focus=ring_focus(view, view.points[[first, second]], *ring.true_ends(items)),
+        focus=_focus(view, (first, second), items),
     )
+
+
+def _focus(view: RunView, numbers: tuple[int, int], items: tuple[SceneItem, ...]) -> Focus:
+    """The ring, and the rays of a pair up to ``RAYS_SEEN``: with far points in view, the ring would be small."""
+    away = view.points[list(numbers)] - view.middle
+    room_m = RAYS_SEEN * view.sphere_m
+    ends = view.middle + away * np.minimum(1.0, room_m / np.linalg.norm(away, axis=1, keepdims=True))
+    return ring_focus(view, ends, *ring.true_ends(items))
 
 
 def _why(roots: PairRoots, arcs: int) -> str:
@@ -266,6 +295,7 @@ def _items(view: RunView, arcs: StageArcs, shown: np.ndarray, numbers: tuple[int
     return (
         arcs.drawn(view, shown, marked, style.SAMPLE, 7.0),
         ring.outline("ring/overlap", ring.circle(view, view.middle, np.zeros(())), style.SPHERE),
+        ring.pieces("ring/pieces", view, arcs.stage.lo_rad[shown], arcs.stage.hi_rad[shown]),
         Segments("ring/candidate", "yaw ring", np.concatenate(spokes), one_color(style.SAMPLE, len(spokes)), 4.0),
         *ring.spokes(view, view.middle, None, middles),
         Segments("pairs/sample", "pairs", ends, one_color(style.SAMPLE, 1), 3.0, ids=ids),
@@ -284,7 +314,7 @@ REACH = 40
 
 def plans(view: RunView, stage: YawStage) -> list[Plan]:
     """Steps for one pair with its arcs, more and more arcs, candidate yaws, and the largest overlap."""
-    arcs = StageArcs(stage)
+    arcs = StageArcs(stage, view.trace.inlier_mask)
     pair, roots, every = partial(_pair, view, arcs), partial(_roots, view, arcs), partial(_all, view, arcs)
     out = [
         Plan("yaw-pair", "One pair of matches", pair, _chart_of(view, arcs, "yaw-pair"), untold=pair),
@@ -313,9 +343,7 @@ GROWING = "yaw-arcs-"
 
 def chosen_arcs(arcs: StageArcs, key: str) -> IntArray | None:
     """Indices of the arcs that a step shows, ascending; None if it shows all."""
-    if key == "yaw-pair":
-        return np.array([arcs.example_in_clique])
-    if key == "yaw-roots":
+    if key in ("yaw-pair", "yaw-roots"):
         return arcs.example
     size = key.removeprefix(GROWING)
     return np.sort(arcs.spread(int(size))) if size != key and size.isdecimal() else None

@@ -200,13 +200,12 @@ def arcs_of(trace: Trace, selected: tuple[int, ...]) -> PairArcs:
 def arcs_of_step(arcs: PairArcs, trace: Trace, step_key: str) -> PairArcs:
     """Of a run's arcs those that a step shows: all of them if it does not choose."""
     stage = trace.stage(YawStage)
-    all_arcs = None if stage is None else StageArcs(stage)
+    all_arcs = None if stage is None else StageArcs(stage, trace.inlier_mask)
     chosen = None if all_arcs is None else chosen_arcs(all_arcs, step_key)
     if all_arcs is None or chosen is None:
         return arcs
-    deepest = float(np.degrees(all_arcs.overlap_of(chosen).yaw_rad))
     some = arcs.pairs[chosen], arcs.lo_rad[chosen], arcs.hi_rad[chosen]
-    return PairArcs(*some, "Only arcs of this step are counted.", deepest)
+    return PairArcs(*some, "Only arcs of this step are counted.", all_arcs.middle_deg(chosen))
 
 
 def at_step(story: YawStory, chart: Chart, arcs: PairArcs) -> YawStory:

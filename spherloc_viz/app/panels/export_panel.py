@@ -29,8 +29,9 @@ WHERE = "Paths without a slash in front begin at the folder in which the playgro
 LINK = box(
     '<button class="copy-link" data-copy="" title="The page\'s address, to be pasted into a message">'
     f'Copy the link to what you see</button><div style="{DIM}">'
-    "It leads to this scene, these settings, this step and this view; reload, back and bookmarks keep them too. On "
-    "another machine, open what follows the # at the address of a playground there.</div>",
+    "It leads to this scene, these settings, this step and this view, on this machine. Somebody else starts spherloc "
+    "and puts what follows the # behind the address of their own page; without spherloc, send the picture or the "
+    "scene below, which opens in any browser.</div>",
     "font-size:12px",
 )
 """The page's script knows the address, see ``touch.js``."""

@@ -34,13 +34,18 @@ WIDTH_PX, RIGHT_PX = 380.0, 12.0
 HEIGHT_PX, FOOT_PX, TOP_PX = 150.0, 117.0, 20.0
 GAP_PX = 5.0
 """Gap between the regular bins and the first and last one, which hold all smaller and larger values."""
+HATCH = (
+    '<defs><pattern id="hatch" width="5" height="5" patternUnits="userSpaceOnUse" patternTransform="rotate(45)">'
+    '<rect width="2" height="5" fill="#101418" fill-opacity=".75"/></pattern></defs>'
+)
+"""What marks matches that the run judged wrongly."""
 UNITS = {"px": "residual (px)", "deg": "residual (°)"}
 
 
-def histogram_svg(histogram: Histogram, names: tuple[str, str], selected: NDArray[np.bool_]) -> str:
-    """A histogram, right matches below wrong ones, which have these ``names``; outlines show how many of the
-    ``selected`` (N,) matches are in a bin. Every bin that is not empty can be pressed."""
-    total = histogram.right + histogram.wrong
+def histogram_svg(histogram: Histogram, selected: NDArray[np.bool_]) -> str:
+    """A histogram, the run's inliers below its outliers, and hatched those of both that it judged wrongly; outlines
+    show how many of the ``selected`` (N,) matches are in a bin. Every bin that is not empty can be pressed."""
+    total = histogram.inliers + histogram.outliers
     top = 1.08 * max(1, int(total.max()))
     y = Scale(0.0, top, FOOT_PX, TOP_PX)
     y_ticks = [tick for tick in round_ticks(0.0, top, 5) if tick == int(tick)]
@@ -62,31 +67,40 @@ def histogram_svg(histogram: Histogram, names: tuple[str, str], selected: NDArra
     parts += [shapes.text(WIDTH_PX - RIGHT_PX, FOOT_PX + 29, f"≥ {texts_x[-1]}", "end"), *_bound(histogram, x)]
     across = [left_px + step * k + GAP_PX * ((k > 0) + (k == bins - 1)) + 0.5 for k in range(bins)]
     chosen = np.bincount(histogram.bin[selected], minlength=bins)
-    parts += _bars(histogram, names, chosen, across, step - 1.0, y)
+    parts += _bars(histogram, chosen, across, step - 1.0, y)
     return shapes.svg(WIDTH_PX, HEIGHT_PX, parts, f"Histogram of residuals, {UNITS[histogram.unit]}")
 
 
-def _bars(
-    histogram: Histogram, names: tuple[str, str], chosen: NDArray[np.int64], across: list[float], width: float, y: Scale
-) -> list[str]:
+def _bars(histogram: Histogram, chosen: NDArray[np.int64], across: list[float], width: float, y: Scale) -> list[str]:
     """One path per colour, and over each bin that is not empty an area to press, as high as the plot."""
-    feet, middle = np.full(len(across), FOOT_PX), y.px(histogram.right)
-    top = y.px(histogram.right + histogram.wrong)
+    inliers, outliers = histogram.inliers, histogram.outliers
+    feet, middle, top = np.full(len(across), FOOT_PX), y.px(inliers), y.px(inliers + outliers)
+    hatched = y.px(inliers - histogram.wrongly_kept), y.px(inliers + histogram.wrongly_rejected)
     parts = [
-        _boxes(across, width, feet, middle, "right", shapes.fill(style.INLIER)),
-        _boxes(across, width, middle, top, "wrong", shapes.fill(style.OUTLIER)),
+        HATCH,
+        _boxes(across, width, feet, middle, "inliers", shapes.fill(style.INLIER)),
+        _boxes(across, width, middle, top, "outliers", shapes.fill(style.OUTLIER)),
+        _boxes(across, width, *hatched, "wrongly", 'fill="url(#hatch)"'),
         _boxes(across, width, feet, y.px(chosen), "chosen", shapes.stroke(style.SELECTED, 2.0)),
     ]
-    press, words = (
-        f'class="bin" fill="transparent" data-touch="{SELECT_BIN}:{histogram.unit}:',
-        bin_words(histogram.unit),
+    press = f'class="bin" fill="transparent" data-touch="{SELECT_BIN}:{histogram.unit}:'
+    wrongly = histogram.wrongly_kept, histogram.wrongly_rejected
+    rows = zip(
+        across, bin_words(histogram.unit), *(counts.tolist() for counts in (inliers, outliers, *wrongly)), strict=True
     )
-    rows = zip(across, words, histogram.right.tolist(), histogram.wrong.tolist(), strict=True)
-    for place, (left, range_words, right, wrong) in enumerate(rows):
-        if right + wrong:
-            tip = shapes.tooltip(f"{range_words}: {right} {names[0]}, {wrong} {names[1]}; click to select")
+    for place, (left, range_words, kept, rejected, wrongly_kept, wrongly_rejected) in enumerate(rows):
+        if kept + rejected:
+            words = (
+                _count(kept, "inliers", wrongly_kept, "kept"),
+                _count(rejected, "outliers", wrongly_rejected, "rejected"),
+            )
+            tip = shapes.tooltip(f"{range_words}: {words[0]}, {words[1]}; click to select")
             parts.append(shapes.rect(left, TOP_PX, width, FOOT_PX - TOP_PX, f'{press}{place}"', tip))
     return parts
+
+
+def _count(count: int, what: str, wrongly: int, done: str) -> str:
+    return f"{count} {what}" + (f" ({wrongly} wrongly {done})" if wrongly else "")
 
 
 def _boxes(across: list[float], width: float, feet: FloatArray, tops: FloatArray, name: str, look: str) -> str:
@@ -211,19 +225,26 @@ def _residuals_html(residuals: Residuals | None, selected: tuple[int, ...]) -> s
         return box(_title("Residuals") + "This run found no pose, so that matches have no residuals.")
     marked = np.zeros(len(residuals.px), dtype=bool)
     marked[list(selected)] = True
-    drawings = "".join(histogram_svg(one, residuals.names, marked) for one in residuals.histograms)
+    drawings = "".join(histogram_svg(one, marked) for one in residuals.histograms)
     note = _note(residuals_caption(residuals))
     return box(_title("Residuals at the estimated pose", "residual") + _legend_html(residuals) + drawings + note)
 
 
 def _legend_html(residuals: Residuals) -> str:
-    """The meaning of the colours: whether a match is right or, where no truth may tell, whether the run kept it."""
-    judged = residuals.judged if "right" in residuals.names else "of this run"
+    """The meaning of the colours, which are those of the canvas, and of the hatching."""
     dots = "".join(
         f'<span style="margin-right:1.1em">{dot_html(color)}{words}</span>'
-        for color, words in zip((style.INLIER, style.OUTLIER), residuals.names, strict=True)
+        for color, words in ((style.INLIER, "inliers"), (style.OUTLIER, "outliers"))
     )
-    return f'<div style="font-size:12px;padding-bottom:.3em">{dots}<span style="{DIM}">{escape(judged)}</span></div>'
+    box_px = 'width="14" height="11"'
+    swatch = (
+        f'<svg {box_px} style="vertical-align:-1px;margin:0 .4em 0 1.1em">{HATCH}'
+        f'<rect {box_px} {shapes.fill(style.UNDECIDED, 0.5)}/><rect {box_px} fill="url(#hatch)"/></svg>'
+    )
+    hatched = f"{swatch}wrongly, by the truth" if residuals.truth_known else ""
+    return (
+        f'<div style="font-size:12px;padding-bottom:.3em">{dots}<span style="{DIM}">of this run</span>{hatched}</div>'
+    )
 
 
 def residuals_caption(residuals: Residuals) -> str:
