@@ -166,3 +166,16 @@ def test_from_above_one_sees_where_the_photographs_were_taken(trace: Trace) -> N
         for dots in ((), (Points(REFERENCES, "cloud", here + np.eye(3), np.zeros((3, 3), np.uint8), 0.1),))
     )
     np.testing.assert_allclose(before.position, after.position, atol=1.0)
+
+
+def test_names_that_would_lie_over_others_give_way_to_the_more_important_ones(trace: Trace) -> None:
+    picture = paint(trace, len(steps(trace)) - 1)
+    view = views.follow(picture, 1.5)
+    layers = ("scale bar", "point cloud", "uncertainty", "cameras")
+    labels = [Label(layer, layer, view.target, "2.jpg") for layer in layers]
+    for count in range(2, len(layers) + 1):
+        crowded = replace(picture, scene=tuple(labels[:count]))
+        assert views.cut(crowded, view, 1.5, 0.02) == set(layers[: count - 1])
+    lower = 0.15 * float(np.linalg.norm(view.target - view.position)) * np.array([0.0, 1.0, 0.0])
+    apart = replace(labels[1], position=view.target + lower)
+    assert views.cut(replace(picture, scene=(labels[3], apart)), view, 1.5, 0.02) == frozenset()

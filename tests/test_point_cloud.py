@@ -11,9 +11,10 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.estimators import estimate
 from spherloc.geometry import camera_centre, pose, yaw_rotation
 from spherloc_viz import style
+from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.frame import length_text
-from spherloc_viz.layers.point_cloud import MAX_NAMED, MAX_POINTS, REFERENCES, cloud_items
-from spherloc_viz.layers.primitives import Label, Points
+from spherloc_viz.layers.point_cloud import FEW_RAYS, MAX_NAMED, MAX_POINTS, REFERENCES, cloud_items, with_few_rays
+from spherloc_viz.layers.primitives import Label, Points, Segments
 from spherloc_viz.layers.where_taken import where_taken
 
 
@@ -34,6 +35,34 @@ def test_points_far_away_are_left_out_and_references_stand_where_they_were_taken
     assert points.ids is None, "a press picks matches, not points of the map"
     poses = [view.cam_from_map for view in scene.references if view.cam_from_map is not None]
     np.testing.assert_allclose(dots.positions @ turn, [camera_centre(pose) for pose in poses], atol=1e-9)
+
+
+def test_references_are_cameras_that_look_where_they_looked() -> None:
+    scene, turn = replace(street(), cloud=np.eye(3)), yaw_rotation(0.7)
+    items = {item.name: item for item in cloud_items(scene, turn)}
+    bodies, dots = items["cloud/cameras"], items[REFERENCES]
+    assert isinstance(bodies, Segments) and isinstance(dots, Points) and bodies.layer == dots.layer
+    poses = [view.cam_from_map for view in scene.references if view.cam_from_map is not None]
+    lines = bodies.points.reshape(len(poses), -1, 2, 3)
+    np.testing.assert_allclose(lines[:, 0, 0], dots.positions, atol=1e-9)
+    axes = (lines[:, :4, 1] - lines[:, :4, 0]).sum(axis=1)
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    np.testing.assert_allclose(axes @ turn, [pose[2, :3] for pose in poses], atol=1e-9)
+    apart = np.linalg.norm(np.diff(dots.positions, axis=0), axis=1).min()
+    assert np.linalg.norm(lines[:, :4, 1] - lines[:, :4, 0], axis=2).max() < apart, "one does not reach into the next"
+
+
+def test_of_many_lines_to_inliers_an_even_sample_is_drawn_and_told() -> None:
+    trace = estimate(scene_problem("mei_outliers_80"), "ransac-2p")
+    all_rays = paint(trace, len(steps(trace)) - 1)
+    (rays,) = (item for item in all_rays.scene if item.name == "rays")
+    assert isinstance(rays, Segments) and 0 < len(rays.points) <= FEW_RAYS and with_few_rays(all_rays) is all_rays
+    many = replace(rays, points=np.repeat(rays.points, 9, axis=0), colors=np.repeat(rays.colors, 9, axis=0))
+    crowded = replace(all_rays, scene=tuple(many if item is rays else item for item in all_rays.scene))
+    (few,) = (item for item in with_few_rays(crowded).scene if item.name == "rays")
+    assert isinstance(few, Segments) and len(few.points) == len(few.colors) == FEW_RAYS
+    assert np.array_equal(few.points[[0, -1]], many.points[[0, -1]])
+    assert f"{FEW_RAYS} of the {len(many.points)} lines" in with_few_rays(crowded).step.note
 
 
 def test_few_references_are_named() -> None:
