@@ -97,7 +97,7 @@ def test_bins_arcs_and_rectangles_select_several(tab: Playground, trace: Trace, 
     tab.tab("Residuals")
     bins = tab.page.locator("rect.bin[data-touch*=':px:']")
     expect(bins.first).to_be_visible()
-    tips = [re.search(r"(\d+) right, (\d+) wrong", bin.text_content() or "") for bin in bins.all()]
+    tips = [re.search(r"(\d+) inliers.*, (\d+) outliers", bin.text_content() or "") for bin in bins.all()]
     counts = [int(tip[1]) + int(tip[2]) for tip in tips if tip]
     assert sum(counts) == 40 and len(counts) == bins.count()
     place = next(k for k in np.argsort(counts)[::-1].tolist() if counts[k] <= 8)
