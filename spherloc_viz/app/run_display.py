@@ -196,7 +196,7 @@ class RunDisplay:
         alternative = None if diagnosis is None else diagnosis.alternative_cam_from_map
         if last and alternative is not None:
             picture = with_alternative(picture, trace, alternative)
-        if last and self._photographs(run) is not None:
+        if last and self._scene_of(run.request.scene.scene) is not None:
             picture = with_few_rays(picture)
         drawn = with_selection(picture, trace, selected)
         beside = controls.items(known, hidden)

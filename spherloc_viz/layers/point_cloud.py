@@ -27,8 +27,7 @@ MAX_NAMED = 12
 REFERENCES = "cloud/references"
 """Name of the dots where the references were taken."""
 FEW_RAYS = 40
-"""Largest number of lines to the inliers at the outcome of a map of photographs, which is about where they were
-taken."""
+"""Largest number of lines to the inliers at the outcome of a query image, which is about where it was taken."""
 
 
 def reference_dots(scene: MapScene, turn: FloatArray) -> Points:
