@@ -18,7 +18,8 @@ from spherloc.estimators import estimate
 from spherloc.proof import write_proof
 from spherloc_viz.commands.cli import play
 from spherloc_viz.commands.flags import refuse_repeated
-from spherloc_viz.commands.scene_commands import localize, run, sweep
+from spherloc_viz.commands.image_commands import localize
+from spherloc_viz.commands.scene_commands import run, sweep
 from tests.waiting import LIMIT_S
 
 PROGRAM = [sys.executable, "-c", "from spherloc_viz.start import main\nmain()"]

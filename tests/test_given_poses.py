@@ -18,7 +18,7 @@ from spherloc.geometry import so3_exp
 from spherloc.problem import Problem
 from spherloc.trajectory import wxyz_from_rotation
 from spherloc.types import FloatArray
-from spherloc_viz.commands import scene_commands
+from spherloc_viz.commands import image_commands
 from spherloc_viz.commands.diagnose import diagnose_poses
 from spherloc_viz.commands.run import Records
 from spherloc_viz.options import usable_estimators
@@ -199,4 +199,4 @@ def test_arguments_that_do_not_go_together(tmp_path: Path) -> None:
     ):
         scenes = (given.pop("scene"),) if "scene" in given else ()
         with pytest.raises(InputError, match=said):
-            scene_commands.diagnose(poses, scenes, record=False, **given)
+            image_commands.diagnose(poses, scenes, record=False, **given)

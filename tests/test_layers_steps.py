@@ -18,6 +18,7 @@ from spherloc_viz import style
 from spherloc_viz.layers import MAX_PICTURES, paint, ring, steps, yaw
 from spherloc_viz.layers.ball_set import BallSet
 from spherloc_viz.layers.frame import RunView
+from spherloc_viz.layers.outcome import early_table
 from spherloc_viz.layers.primitives import Balls, Label, Picture, Points, SceneItem, Segments, true_minus
 from spherloc_viz.layers.ransac import MAX_IMPROVEMENTS
 from spherloc_viz.layers.yaw import StageArcs
@@ -475,4 +476,24 @@ def test_negative_numbers_have_a_true_minus(mc: Trace) -> None:
     assert (
         true_minus("-1 (-.5) Eq. 24-27, a-1, 2026-01-02, 1e-16")
         == "\N{MINUS SIGN}1 (\N{MINUS SIGN}.5) Eq. 24-27, a-1, 2026-01-02, 1e-16"
+    )
+
+
+def test_the_clique_tells_how_many_of_its_matches_the_run_keeps(mc: Trace) -> None:
+    stage = of(mc, TranslationStage)
+    assert isinstance(stage, TranslationStage)
+    members = np.unique(stage.pairs[stage.clique])
+    kept = int(np.count_nonzero(mc.inlier_mask[members]))
+    told = f"of the {len(members)} matches, the run keeps {kept}."
+    assert 0 < kept < len(members) and at(mc, "clique").step.note.endswith(told)
+
+
+def test_times_of_stages_and_the_rest_are_the_whole_time(mc: Trace) -> None:
+    def told(**times_ms: float) -> str:
+        return dict((row[0], row[1]) for row in early_table(replace(mc, timings_ms=times_ms), None).rows)["solved in"]
+
+    assert told(guess=0.5, refinement=1.0, total=5.0) == "5.0 ms (guess 0.5, refinement 1.0, the rest 3.5)"
+    assert (
+        told(guess=0.5, refinement=1.0, total=1.6) == "1.6 ms (guess 0.5, refinement 1.0)"
+        and told(total=2.0) == "2.0 ms"
     )

@@ -13,6 +13,7 @@ from tyro.extras import SubcommandApp
 
 from spherloc.errors import SpherlocError, reason, show
 from spherloc_viz import given_files
+from spherloc_viz.commands import image_commands as of_images
 from spherloc_viz.commands import recording_commands as of_runs
 from spherloc_viz.commands import scene_commands as of_scenes
 from spherloc_viz.commands.flags import INTERRUPTED, RECORDINGS, Flag, OptionalFloat, OptionalPath, refuse_repeated
@@ -186,9 +187,9 @@ COMMANDS = (
     lesson,
     gallery,
     of_scenes.run,
-    of_scenes.localize,
-    of_scenes.diagnose,
-    of_scenes.map,
+    of_images.localize,
+    of_images.diagnose,
+    of_images.map,
     of_scenes.sweep,
     of_scenes.verify,
     of_runs.runs,

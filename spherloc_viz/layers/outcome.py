@@ -1,5 +1,7 @@
 """The outcome of a run: its last step, its tables, and its certificate in words."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from spherloc.geometry import camera_centre
@@ -158,9 +160,18 @@ def early_table(trace: Trace, judged: Judgement | None) -> Table:
         rows.append(("F1", f"{100 * metrics.f1:.3g} %"))
     if trace.certificate is not None:
         rows += _certificate_rows(trace.certificate, explained)
-    stages = ", ".join(f"{name} {value:.1f}" for name, value in trace.timings_ms.items() if name != "total")
-    rows.append(("solved in", f"{trace.timings_ms['total']:.1f} ms" + (f" ({stages})" if stages else "")))
+    rows.append(("solved in", _times(trace.timings_ms)))
     return Table("outcome", ("", "this run"), tuple(rows))
+
+
+def _times(timings_ms: Mapping[str, float]) -> str:
+    """The time of a run and its stages, with what is left over if that is a tenth or more."""
+    total, stages = timings_ms["total"], {name: value for name, value in timings_ms.items() if name != "total"}
+    rest = total - sum(stages.values())
+    parts = [f"{name} {value:.1f}" for name, value in stages.items()]
+    if parts and rest >= 0.1 * total:
+        parts.append(f"the rest {rest:.1f}")
+    return f"{total:.1f} ms" + (f" ({', '.join(parts)})" if parts else "")
 
 
 def _judged(judged: Judgement, success: bool | None) -> str:

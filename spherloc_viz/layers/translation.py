@@ -227,15 +227,21 @@ def _members(view: RunView, balls: BallSet, size: int) -> Frame:
 def _clique(view: RunView, balls: BallSet) -> Frame:
     stage, start = balls.stage, view.aligned_pose(balls.stage.cam_from_map)
     members = view.mask(stage.pairs[stage.clique])
+    kept, found = np.count_nonzero(members & view.trace.inlier_mask), np.count_nonzero(members)
+    lost = (
+        ""
+        if kept == found
+        else f" Balls that overlap in pairs need not share a point: of the {found} matches, the run keeps {kept}."
+    )
     largest = "the largest such set" if stage.proven else "the largest set found before the search reached its limit"
     return Frame(
-        f"{len(stage.clique):,} of {len(balls):,} balls overlap pairwise, from {np.count_nonzero(members)} matches: "
+        f"{len(stage.clique):,} of {len(balls):,} balls overlap pairwise, from {found} matches: "
         f"{largest}. The best of its pairs puts the camera at {view.position(start)}.",
         "‖t_k1 − t_k2‖ ≤ r_k1 + r_k2   (Eq. 38)",
         start,
         view.colors(style.UNDECIDED, (members, style.CLIQUE)),
         view.no_matches(),
-        note=_note(balls, balls.by_radius, balls.in_clique),
+        note=f"{_note(balls, balls.by_radius, balls.in_clique)}{lost}".strip(),
         located=True,
         sphere_aside=True,
         items=(*balls.items(view, balls.by_radius, balls.in_clique), _clique_name(balls)),

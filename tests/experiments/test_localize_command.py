@@ -27,9 +27,9 @@ from spherloc.mapping.scene_files import MODEL, SCENE
 from spherloc.trajectory import read_tum
 from spherloc.warm_up import warm_up
 from spherloc_viz.commands.bundled import all_scenes, one_kind
+from spherloc_viz.commands.image_commands import _results_name
 from spherloc_viz.commands.localize import Solving, compare_sequences, localize_sequence
 from spherloc_viz.commands.run import Records
-from spherloc_viz.commands.scene_commands import _results_name
 from spherloc_viz.plots.trajectories import backdrop_of, trajectory_png
 from spherloc_viz.recording.content.data import read_recording
 from tests.cli_process import spherloc_here
