@@ -9,7 +9,6 @@ the cloud may be smaller, and the position of the camera can be given.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +34,7 @@ from spherloc.datasets.point_cloud import (
 from spherloc.errors import InputError, show
 from spherloc.geometry import DOWN, camera_centre, pose, so3_exp, transform, yaw_rotation
 from spherloc.problem import Problem
-from spherloc.types import BoolArray, FloatArray
+from spherloc.types import FloatArray
 
 EXAMPLE = """\
 kind = "synthetic"
@@ -61,10 +60,6 @@ draws = "uniform"                 # optional: of coordinates, in the cube; or "n
 
 MAX_CORRESPONDENCES = 10_000
 MAX_GRAVITY_ERROR_DEG = 10.0
-KEPT = 4
-"""Number of scenes whose draws are kept, for problems that differ in their noise."""
-TILT = 4
-"""Of the seven streams of random numbers, the one of gravity's error."""
 GRAVITY_BOUND_SD = 3.0
 """The bound on gravity, in standard deviations. Errors beyond it (1.1 %) are drawn again, so that the bound is true."""
 LIMITS: Mapping[str, tuple[float, float]] = {
@@ -153,19 +148,30 @@ class SyntheticScene:
         """
         if seed is not None and seed != self.seed:
             return replace(self, seed=seed).problem()
-        exact, lens = self._exact(), Lens(self.camera, self.field_of_view_deg)
-        truth, outliers, pixels = exact.truth, exact.outliers, self._noisy(lens, exact.pixels, exact.shift)
-        if exact.other_pixels is not None:
-            pixels[outliers] = self._noisy(lens, exact.other_pixels, exact.shift)[outliers]
-        elif exact.wrong_pixels is not None:
-            pixels[outliers] = exact.wrong_pixels[outliers]
+        streams = [np.random.default_rng([self.seed, stream]) for stream in range(7)]
+        geometry, noise, choice, wrong, tilt, second, ahead = streams
+        drawn, lens = random_poses(geometry, 1, self.draws)[0], Lens(self.camera, self.field_of_view_deg)
+        truth = drawn if self.true_camera is None else _placed(self.true_camera)
+        other = second_pose(second, truth, self.field_of_view_deg) if self.outlier_kind == "coherent" else None
+        poses = [truth] if other is None else [truth, other]
+        cloud = Cloud(self.name, float(camera_centre(drawn)[1]), self.cloud_height_m, self.draws)
+        points, shift = cloud.seen_from((geometry, noise, ahead), self.correspondences, lens, drawn, poses)
+        outliers = np.zeros(self.correspondences, dtype=bool)
+        outliers[choice.permutation(self.correspondences)[: round(self.outlier_rate * self.correspondences)]] = True
+        pixels = self._noisy_pixels(lens, truth, points, shift)
+        if other is not None:
+            pixels[outliers] = self._noisy_pixels(lens, other, points, shift)[outliers]
+        elif self.outlier_kind == "repeated":
+            points[outliers] = copies(second, lens, truth, points)[outliers]
+        else:
+            pixels[outliers] = random_pixels(wrong, lens, points, self.name, self.draws)[outliers]
         gravity_sd_rad = float(np.radians(self.gravity_error_deg))
         return Problem(
             name=self.name,
             camera=self.camera,
             pixels=pixels,
-            points=exact.points,
-            gravity_camera=_tilted_down(np.random.default_rng([self.seed, TILT]), gravity_sd_rad),
+            points=points,
+            gravity_camera=_tilted_down(tilt, gravity_sd_rad),
             gravity_map=DOWN,
             gravity_bound_rad=GRAVITY_BOUND_SD * gravity_sd_rad,
             gravity_sd_rad=gravity_sd_rad or None,
@@ -189,38 +195,13 @@ class SyntheticScene:
         ]
         return f"synthetic: {', '.join(filter(None, parts))}"
 
-    def _exact(self) -> "_Exact":
-        """What is drawn; scenes that differ in their noise alone, as while its slider is dragged, share it."""
-        try:
-            return _kept(replace(self, name="", noise_px=0.0, gravity_error_deg=0.0, bound_px=None))
-        except (InputError, TypeError):  # the sentence must name the scene; and not every camera can be a key
-            return self._drawn()
-
-    def _drawn(self) -> "_Exact":
-        streams = [np.random.default_rng([self.seed, stream]) for stream in (*range(TILT), *range(TILT + 1, 7))]
-        geometry, noise, choice, wrong, second, ahead = streams
-        drawn, lens = random_poses(geometry, 1, self.draws)[0], Lens(self.camera, self.field_of_view_deg)
-        truth = drawn if self.true_camera is None else _placed(self.true_camera)
-        other = second_pose(second, truth, self.field_of_view_deg) if self.outlier_kind == "coherent" else None
-        poses = [truth] if other is None else [truth, other]
-        cloud = Cloud(self.name, float(camera_centre(drawn)[1]), self.cloud_height_m, self.draws)
-        points, shift = cloud.seen_from((geometry, noise, ahead), self.correspondences, lens, drawn, poses)
-        outliers = np.zeros(self.correspondences, dtype=bool)
-        outliers[choice.permutation(self.correspondences)[: round(self.outlier_rate * self.correspondences)]] = True
-        pixels, *others = (self.camera.project(transform(place, points))[0] for place in poses)
-        wrong_pixels = None
-        if self.outlier_kind == "repeated":
-            points[outliers] = copies(second, lens, truth, points)[outliers]
-        elif other is None:
-            wrong_pixels = random_pixels(wrong, lens, points, self.name, self.draws)
-        return _Exact(truth, points, pixels, shift, outliers, others[0] if others else None, wrong_pixels)
-
-    def _noisy(self, lens: Lens, pixels: FloatArray, shift: FloatArray) -> FloatArray:
-        """The pixels (N, 2), moved by ``noise_px`` times ``shift`` (N, 2).
+    def _noisy_pixels(self, lens: Lens, cam_from_map: FloatArray, points: FloatArray, shift: FloatArray) -> FloatArray:
+        """Pixels (N, 2) of the points (N, 3), moved by ``noise_px`` times ``shift`` (N, 2).
 
         At the border they are moved inwards, so that all stay visible: the points must not depend on the noise, since
         moving its slider would otherwise replace some of them.
         """
+        pixels = self.camera.project(transform(cam_from_map, points))[0]
         shift = self.noise_px * shift
         for attempt in range(60):
             lost = ~lens.sees(pixels + shift)
@@ -228,31 +209,6 @@ class SyntheticScene:
                 break
             shift[lost] *= -1.0 if attempt % 2 == 0 else -0.5
         return pixels + shift
-
-
-@dataclass(frozen=True, eq=False)
-class _Exact:
-    """A problem of N correspondences before there is noise."""
-
-    truth: FloatArray
-    """True pose (3, 4)."""
-    points: FloatArray
-    """Map points (N, 3), m, as they are matched."""
-    pixels: FloatArray
-    """True pixels (N, 2)."""
-    shift: FloatArray
-    """(N, 2) the noise, of standard deviation 1."""
-    outliers: BoolArray
-    """Mask (N,)."""
-    other_pixels: FloatArray | None
-    """Pixels (N, 2) from the one wrong pose with which all outliers agree, before noise."""
-    wrong_pixels: FloatArray | None
-    """Pixels (N, 2) from wrong poses of their own."""
-
-
-@lru_cache(maxsize=KEPT)
-def _kept(scene: SyntheticScene) -> _Exact:
-    return scene._drawn()
 
 
 def _placed(true_camera: TrueCamera) -> FloatArray:
