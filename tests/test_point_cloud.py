@@ -56,13 +56,13 @@ def test_of_many_lines_to_inliers_an_even_sample_is_drawn_and_told() -> None:
     trace = estimate(scene_problem("mei_outliers_80"), "ransac-2p")
     all_rays = paint(trace, len(steps(trace)) - 1)
     (rays,) = (item for item in all_rays.scene if item.name == "rays")
-    assert isinstance(rays, Segments) and 0 < len(rays.points) <= FEW_RAYS and with_few_rays(all_rays) is all_rays
+    assert isinstance(rays, Segments) and 0 < len(rays.points) <= FEW_RAYS and with_few_rays(all_rays, 20) is all_rays
     many = replace(rays, points=np.repeat(rays.points, 9, axis=0), colors=np.repeat(rays.colors, 9, axis=0))
     crowded = replace(all_rays, scene=tuple(many if item is rays else item for item in all_rays.scene))
-    (few,) = (item for item in with_few_rays(crowded).scene if item.name == "rays")
+    (few,) = (item for item in with_few_rays(crowded, 701).scene if item.name == "rays")
     assert isinstance(few, Segments) and len(few.points) == len(few.colors) == FEW_RAYS
     assert np.array_equal(few.points[[0, -1]], many.points[[0, -1]])
-    assert f"{FEW_RAYS} of the {len(many.points)} lines" in with_few_rays(crowded).step.note
+    assert f"{FEW_RAYS} of the 701 lines" in with_few_rays(crowded, 701).step.note
 
 
 def test_few_references_are_named() -> None:

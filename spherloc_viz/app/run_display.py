@@ -197,7 +197,7 @@ class RunDisplay:
         if last and alternative is not None:
             picture = with_alternative(picture, trace, alternative)
         if last and self._scene_of(run.request.scene.scene) is not None:
-            picture = with_few_rays(picture)
+            picture = with_few_rays(picture, int(np.count_nonzero(trace.inlier_mask)))
         drawn = with_selection(picture, trace, selected)
         beside = controls.items(known, hidden)
         names = {item.name for item in beside if isinstance(item, Label) and item.layer == "trajectory"}

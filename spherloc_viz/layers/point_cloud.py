@@ -38,14 +38,14 @@ def reference_dots(scene: MapScene, turn: FloatArray) -> Points:
     return Points(REFERENCES, LAYER, places, one_color(style.REFERENCE, len(places)), REFERENCE_DOT * size_m)
 
 
-def with_few_rays(picture: Picture) -> Picture:
-    """The picture with an even sample of the lines to the inliers, and a note of that."""
+def with_few_rays(picture: Picture, inliers: int) -> Picture:
+    """The picture with an even sample of the lines to so many inliers, and a note of that."""
     rays = next((item for item in picture.scene if item.name == "rays"), None)
     if not isinstance(rays, Segments) or len(rays.points) <= FEW_RAYS:
         return picture
     kept = even(np.arange(len(rays.points)), FEW_RAYS)
     few = replace(rays, points=rays.points[kept], colors=rays.colors[kept])
-    note = f"{picture.step.note} {FEW_RAYS} of the {len(rays.points):,} lines to the inliers are drawn.".strip()
+    note = f"{picture.step.note} {FEW_RAYS} of the {inliers:,} lines to the inliers are drawn.".strip()
     scene = tuple(few if item is rays else item for item in picture.scene)
     return replace(picture, step=replace(picture.step, note=note), scene=scene)
 

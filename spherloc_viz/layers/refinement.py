@@ -140,7 +140,9 @@ def _outliers(view: RunView, stage: RefinementStage) -> Frame:
         state,
         view.colors(style.UNDECIDED, (~mask, style.OUTLIER)),
         ~mask,
-        note=f"The first {style.MAX_DRAWN_RAYS} lines are drawn." if len(errors) > style.MAX_DRAWN_RAYS else "",
+        note=f"{style.MAX_DRAWN_RAYS} of {len(errors):,} lines are drawn, evenly."
+        if len(errors) > style.MAX_DRAWN_RAYS
+        else "",
         located=True,
     )
 

@@ -15,7 +15,7 @@ from spherloc.problem import Problem
 from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers.camera_shape import CORNERS, camera
-from spherloc_viz.layers.frame import Frame, RunView, icosphere, one_color
+from spherloc_viz.layers.frame import Frame, RunView, even, icosphere, one_color
 from spherloc_viz.layers.point_cloud import MAX_NAMED
 from spherloc_viz.layers.primitives import Label, Mesh, Points, SceneItem, Segments, Textured
 from spherloc_viz.layers.query_image import modified, sphere_texture
@@ -107,7 +107,7 @@ def _sphere(view: RunView, frame: Frame) -> list[SceneItem]:
     aligned = view.trace.problem.aligned
     key = frame.cam_from_map.tobytes(), frame.sphere_aside, _changed(view.trace.problem)
     surfaces, dots = view.kept("sphere", key, lambda: _placed_sphere(view, frame))
-    drawn = np.flatnonzero(frame.rays[aligned.index])[: style.MAX_DRAWN_RAYS]
+    drawn = even(np.flatnonzero(frame.rays[aligned.index]), style.MAX_DRAWN_RAYS)
     ends = np.stack([dots[drawn], view.points[aligned.index[drawn]]], axis=1)
     colors = frame.colors[aligned.index]
     return [

@@ -54,7 +54,7 @@ def _problem(view: RunView) -> Frame:
 def _problem_note(problem: Problem, count: int, lost: int) -> str:
     note = f"{lost} pixels lie where the camera sees nothing and count as outliers." if lost else ""
     if count - lost > style.MAX_DRAWN_RAYS:
-        note = f"The first {style.MAX_DRAWN_RAYS} of {count - lost:,} lines are drawn. {note}".strip()
+        note = f"{style.MAX_DRAWN_RAYS} of {count - lost:,} lines are drawn, evenly. {note}".strip()
     if problem.estimated_outlier_rate is not None:
         note += f" The front end expects about {100 * problem.estimated_outlier_rate:.0f} % to be wrong."
     return " ".join([note, *problem.remarks]).strip()

@@ -257,7 +257,7 @@ def _focus(view: RunView, numbers: tuple[int, int], items: tuple[SceneItem, ...]
     """The ring, and the rays of a pair up to ``RAYS_SEEN``: with far points in view, the ring would be small."""
     away = view.points[list(numbers)] - view.middle
     room_m = RAYS_SEEN * view.sphere_m
-    ends = view.middle + away * np.minimum(1.0, room_m / np.linalg.norm(away, axis=1, keepdims=True))
+    ends = view.middle + away * np.minimum(1.0, room_m / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12))
     return ring_focus(view, ends, *ring.true_ends(items))
 
 
