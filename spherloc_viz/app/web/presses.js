@@ -1,10 +1,11 @@
 // A press counts for what was under the pointer when it went down, also if the page has moved beneath it before it went
-// up: a browser makes a click of the two only where both meet the same element. And who has chosen from a list goes on
-// with keys, which must not be written into its box. A finger on the canvas picks as a mouse does: a browser lets the
-// element under a finger capture it, and viser takes what is captured for a drag of one of its handles.
+// up, or has drawn the same anew: a browser makes a click of the two only where both meet the same element. And who has
+// chosen from a list goes on with keys, which must not be written into its box. A finger on the canvas picks as a mouse
+// does: a browser lets the element under a finger capture it, and viser takes what is captured for a drag of one of its
+// handles.
 (() => {
-  const PRESSABLE = "button,a[href],label,summary,input,[role=option],[role=checkbox],[role=switch]", STILL_PX = 4;
-  const AFTER_CHOICE_MS = 50;
+  const PRESSABLE = "button,a[href],label,summary,input,[data-define],[role=option],[role=checkbox],[role=switch]";
+  const STILL_PX = 4, AFTER_CHOICE_MS = 50;
   let down = null, leaving = 0;
 
   const pressable = (target) => (target instanceof Element ? target.closest(PRESSABLE) : null);
@@ -14,16 +15,18 @@
       event.target.releasePointerCapture(event.pointerId);
     }
     const element = event.isPrimary && event.button === 0 ? pressable(event.target) : null;
-    down = element && { element, x: event.clientX, y: event.clientY };
+    down = element && { element, html: element.outerHTML, x: event.clientX, y: event.clientY };
     clearTimeout(leaving);
   }, true);
 
   addEventListener("pointerup", (event) => {
     const pressed = down;
     down = null;
-    if (!pressed?.element.isConnected || !(event.target instanceof Node)) return;
-    if (pressed.element.contains(event.target)) return;
-    if (Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) < STILL_PX) pressed.element.click();
+    if (!pressed || !(event.target instanceof Node) || pressed.element.contains(event.target)) return;
+    if (Math.hypot(event.clientX - pressed.x, event.clientY - pressed.y) >= STILL_PX) return;
+    const beneath = pressable(event.target);
+    if (pressed.element.isConnected) pressed.element.click();
+    else if (beneath?.outerHTML === pressed.html) beneath.click();
   }, true);
 
   addEventListener("pointercancel", () => { down = null; }, true);
