@@ -13,9 +13,10 @@ import gc
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -98,6 +99,19 @@ def compile_apart(estimator: str, stopped: Callable[[], bool]) -> None:
     Returns when that is done, at once if nothing is missing, or soon after ``stopped`` returns true.
     """
     _compile_in_order([part for part in (*SHARED, *_runs(estimator)) if not _is_compiled(part)], stopped, niceness=10)
+
+
+@contextlib.contextmanager
+def compiled_meanwhile(estimator: str) -> Iterator[None]:
+    """Compile the kernels of an estimator on processors that what is done within leaves idle, as long as it lasts."""
+    stopped = threading.Event()
+    compilation = threading.Thread(target=compile_apart, args=(estimator, stopped.is_set), daemon=True)
+    compilation.start()
+    try:
+        yield
+    finally:
+        stopped.set()
+        compilation.join()
 
 
 def tiny_problem() -> Problem:

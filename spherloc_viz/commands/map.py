@@ -12,7 +12,7 @@ import signal
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,8 @@ from spherloc_viz.commands.map_report import MAP_FEATURES, map_report, summary
 from spherloc_viz.commands.progress import progress, say
 
 REPORT = "report.html"
+ESTIMATOR = "mc"
+"""What localizes new images, unless another estimator is chosen."""
 MAX_METRES = 1e6
 """Heights and distances are below this."""
 MAX_SIZES = 4
@@ -68,7 +70,7 @@ def make(
     end_without_a_trace()
     how = how_of(features)
     target = output or Path(f"{folder.resolve().name}_map")
-    with _stages() as tell:
+    with _stages() as tell, _compiled_for(new_images):
         if video is not None:
             _take_frames(*video, folder, tell)
         found = photographs(folder, cameras, masks, panorama)
@@ -159,6 +161,15 @@ def _take_frames(video: Path, count: int, folder: Path, tell: Tell) -> None:
         tell("frames taken from the video", len(taken), count)
 
     frames_of(video, folder, count, another)
+
+
+def _compiled_for(new_images: Path | None) -> AbstractContextManager[None]:
+    """While a map is made, compile what localizes the new images in it."""
+    if new_images is None:
+        return nullcontext()
+    from spherloc.warm_up import compiled_meanwhile
+
+    return compiled_meanwhile(ESTIMATOR)
 
 
 @contextmanager

@@ -139,9 +139,11 @@ def preset_names(known: Sequence[Preset], hidden: bool) -> tuple[str, ...]:
 
 
 def story_html(preset: Preset, changed: bool) -> str:
-    """A preset's story, dimmed if the page was ``changed`` since. Both take the same room, that of the longer text."""
-    after = f"Changed from the preset {preset.title}: {preset.story}"
-    texts = ((after, DIM),) if changed else ((after, "visibility:hidden"), (preset.story, ""))
+    """A preset's story and estimator, dimmed if the page was ``changed`` since. Both take the same room, that of the
+    longer text."""
+    story = f"{preset.story} Estimator: {preset.estimator}."
+    after = f"Changed from the preset {preset.title}: {story}"
+    texts = ((after, DIM),) if changed else ((after, "visibility:hidden"), (story, ""))
     words = "".join(f'<div style="grid-area:1/1;{look}">{escape(text)}</div>' for text, look in texts)
     return box(f'<div style="display:grid">{words}</div>', "font-size:12px")
 
@@ -237,7 +239,7 @@ class Controls:
     def _build_play(self, gui: viser.GuiApi, touches: Touches) -> None:
         gui.add_html(heading_html("Drag a slider: it is solved anew meanwhile", "estimator"))
         self._preset = gui.add_dropdown(
-            "Preset", preset_names(self._presets, False), hint="Each of them shows one thing."
+            "Preset", preset_names(self._presets, False), hint="Each sets a scene, an estimator and its options, and shows one thing."
         )
         self._preset.on_update(self._choose_preset)
         self._story = gui.add_html("", visible=False)
