@@ -85,8 +85,15 @@ def test_a_phone_shows_the_canvas_and_what_the_step_says(browser: Browser, addre
     settings.click()
     expect(tab.page.get_by_role("tab", name="Play", exact=True)).to_be_visible()
     expect(captions).to_have_count(0)
+
+    def is_above_the_settings() -> bool:
+        title = settings.bounding_box()
+        return title is not None and tab.page.evaluate(bottom) <= min(title["y"], 0.5 * 844)
+
+    tab.until(is_above_the_settings, "the canvas ends where the settings begin")
     settings.click()
     expect(captions).not_to_contain_text("Outcome")
+    tab.until(lambda: tab.page.evaluate(bottom) > 0.6 * 844, "the canvas has its place again")
     tab.page.set_viewport_size(SIZE)
     tab.expect_quiet(address)
     tab.close()

@@ -11,7 +11,7 @@
   let bar = null, words = null, projector = false, folded = false, roomMade = false, foldedHere = false;
   let toldWidth = 0, toldWindow = 0, toggledAt = -Infinity;
 
-  // While the settings are unfolded on a narrow screen, they take it all.
+  // While the settings are unfolded on a narrow screen, they take the place of the captions.
   const small = () => innerWidth < NARROW_PX;
   const unfolded = () => [...document.querySelectorAll("[data-ready]")].some((one) => one.getClientRects().length > 0);
   const narrow = () => small() && folded && !unfolded();
@@ -86,6 +86,14 @@
     document.body.style.setProperty("--captions", `${bar.getBoundingClientRect().height}px`);
   }
 
+  // The canvas of a narrow screen ends where the unfolded settings begin, so that a slider moves what can be seen.
+  function leaveRoom() {
+    const sheet = '[class*=Paper-root][style*="position: fixed; bottom: 0px"]';
+    const found = small() && unfolded() ? document.querySelector(sheet) : null;
+    document.body.classList.toggle("unfolded", found !== null);
+    if (found) document.body.style.setProperty("--canvas", `${Math.round(found.getBoundingClientRect().top)}px`);
+  }
+
   function toggle() {
     projector = !projector;
     document.body.classList.toggle("projector", projector);
@@ -124,6 +132,7 @@
     makeRoom();
     const wanted = (projector || narrow()) && document.querySelector(".step-words") && !document.querySelector(".introduction");
     document.body.classList.toggle("narrow", narrow());
+    leaveRoom();
     if (!wanted) {
       bar?.remove();
       bar = null;
