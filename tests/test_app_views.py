@@ -133,6 +133,23 @@ def test_the_sphere_does_not_stand_before_a_ball(trace: Trace) -> None:
         assert apart_m.min() > radius_m, np.degrees(turn)
 
 
+def test_from_above_a_street_lies_along_the_longer_side_of_the_canvas(trace: Trace) -> None:
+    picture = paint(trace, len(steps(trace)) - 1)
+    (camera,) = (item for item in picture.scene if item.name == "cameras/estimate")
+    assert isinstance(camera, Segments)
+    here = camera.points[0, 0]
+    for street, square in ((0, 2), (2, 0)):
+        walk = here + np.linspace(-0.5, 0.5, 9)[:, None] * np.eye(3)[street]
+        dots = Points(REFERENCES, "cloud", walk, np.zeros((9, 3), np.uint8), 0.1)
+        for aspect, longer in ((2.0, 0), (0.5, 1)):
+            view = views.find("Above", replace(picture, scene=(*picture.scene, dots)), aspect)
+            spread = np.ptp(views.projected(view, walk), axis=0)
+            assert spread[longer] > 5 * spread[1 - longer], (street, aspect)
+        view = views.find("Above", replace(picture, scene=(*picture.scene, dots)), 1.0)
+        spread = np.ptp(views.projected(view, np.vstack([here, here + 0.1 * np.eye(3)[square]])), axis=0)
+        assert spread[0 if square == 0 else 1] > spread[1 if square == 0 else 0], "else the x axis is level"
+
+
 def test_from_above_one_sees_where_the_photographs_were_taken(trace: Trace) -> None:
     """If that is a small part of the map, and the camera has a position; else the whole map."""
     picture = paint(trace, len(steps(trace)) - 1)

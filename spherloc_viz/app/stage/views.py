@@ -51,6 +51,9 @@ DIRECTIONS = {
     "Balls": (0.35, -0.45, -0.8),
 }
 """Directions of the views, from the subject to the viewer; y points down."""
+SIDEWAYS, NEARER = (-0.02, -1.0, 0.0), 0.75
+"""Direction of the view from above with the map's x axis upright, which is taken if that brings the viewer to less than
+this share of the distance: a street fills a wide canvas so or so."""
 STEEP = (0.3, -2.0, -0.6)
 """Direction from which a view looks over walls."""
 INSIDE = "From the camera"
@@ -252,6 +255,11 @@ def _clear(
     name: str, picture: Picture, subject: FloatArray, clear: FloatArray, aspect: float, walls: Walls | None
 ) -> Viewpoint:
     """A view of a subject (K, 3) from the direction of a named view, turned so that little hides ``clear`` (L, 3)."""
+    if name == "Above":
+        positions, targets = _fits(subject, np.array([DIRECTIONS[name], SIDEWAYS]), aspect)
+        upright, sideways = np.linalg.norm(positions - targets, axis=1)
+        turned = int(sideways < NEARER * upright)
+        return Viewpoint(positions[turned], targets[turned])
     if name not in ("Sphere", "Balls") and (name != "Overview" or walls is None):
         return _fit(subject, np.array(DIRECTIONS[name]), aspect)
     sides = [DIRECTIONS[name]] if walls is None else [DIRECTIONS[name], STEEP]
