@@ -239,7 +239,9 @@ class Controls:
     def _build_play(self, gui: viser.GuiApi, touches: Touches) -> None:
         gui.add_html(heading_html("Drag a slider: it is solved anew meanwhile", "estimator"))
         self._preset = gui.add_dropdown(
-            "Preset", preset_names(self._presets, False), hint="Each sets a scene, an estimator and its options, and shows one thing."
+            "Preset",
+            preset_names(self._presets, False),
+            hint="Each sets a scene, an estimator and its options, and shows one thing.",
         )
         self._preset.on_update(self._choose_preset)
         self._story = gui.add_html("", visible=False)
