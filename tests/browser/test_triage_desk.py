@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playground import FLAGS, PATIENCE_MS, SCENE, find_chromium, served
@@ -159,6 +160,26 @@ def test_what_is_brushed_is_what_is_listed(desk: Desk) -> None:
     expect(desk.page.locator("#chips", has_text="lasso")).to_have_count(0)
     desk.drag("#parallel", (0.86, 0.1), (0.86, 0.5))
     expect(desk.page.locator("#chips", has_text="rotation error")).to_be_visible()
+
+
+def test_a_wide_screen_shows_all_larger_and_brushes_the_same(desk: Desk) -> None:
+    desk.page.locator("#plot-x").select_option("seed")
+    ranges = []
+    for width_px, zoom in ((1280, 1.0), (3600, 2.0)):
+        desk.page.set_viewport_size({"width": width_px, "height": 800})
+        desk.page.wait_for_function("width => document.querySelector('#scatter').width > 0.2 * width", arg=width_px)
+        plot = desk.page.locator("#scatter")
+        box = plot.bounding_box()
+        assert box is not None and plot.evaluate("one => one.width") == pytest.approx(box["width"], abs=6)
+        left, right = 46.0 * zoom, 10.0 * zoom  # margins
+        low, high = ((left + share * (box["width"] - left - right)) / box["width"] for share in (0.4, 0.6))
+        desk.drag("#scatter", (low, 0.02), (high, 0.98))
+        chip = desk.page.locator("#chips", has_text="seed:")
+        expect(chip).to_be_visible()
+        ranges.append([float(word) for word in re.findall(r"seed: (\S+) to (\S+)", chip.inner_text())[0]])
+        desk.page.get_by_role("button", name="Clear all filters").click()
+        desk.listed(2 * SEEDS)
+    np.testing.assert_allclose(*ranges, atol=0.02 * SEEDS)
 
 
 def test_unknown_values_can_be_brushed(desk: Desk) -> None:

@@ -74,8 +74,18 @@ class Axis {
   }
 }
 
+// How much larger a wide window shows the page than its style says.
+const zoomOf = (canvas) => canvas.getBoundingClientRect().width / canvas.offsetWidth || 1;
+
+// Where a press is on a canvas, and how large that is, in the pixels of its style.
+function pressed(event, canvas) {
+  const box = canvas.getBoundingClientRect(), zoom = zoomOf(canvas);
+  const inside = [event.clientX - box.left, event.clientY - box.top, box.width, box.height].map((value) => value / zoom);
+  return { x: inside[0], y: inside[1], width: inside[2], height: inside[3] };
+}
+
 function sized(canvas) {
-  const scale = window.devicePixelRatio || 1;
+  const scale = (window.devicePixelRatio || 1) * zoomOf(canvas);
   const width = Math.round(canvas.clientWidth * scale), height = Math.round(canvas.clientHeight * scale);
   if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
   return scale;
@@ -112,9 +122,9 @@ class Points {
     this.redrawn = () => {};
   }
   spot(event) {
-    const box = this.canvas.getBoundingClientRect(), edge = this.edge();
-    const x = (event.clientX - box.left - edge.left) / (box.width - edge.left - edge.right);
-    const y = 1 - (event.clientY - box.top - edge.top) / (box.height - edge.top - edge.bottom);
+    const at = pressed(event, this.canvas), edge = this.edge();
+    const x = (at.x - edge.left) / (at.width - edge.left - edge.right);
+    const y = 1 - (at.y - edge.top) / (at.height - edge.top - edge.bottom);
     return [Math.min(1, Math.max(0, x)), Math.min(1, Math.max(0, y))];
   }
   edge() { return this.withAxes ? MARGIN : { left: 6, right: 6, top: 6, bottom: 6 }; }
@@ -218,10 +228,10 @@ class Parallel {
     this.redrawn = () => {};
   }
   spot(event) {
-    const box = this.canvas.getBoundingClientRect();
-    const step = (box.width - 40) / Math.max(1, this.axes.length - 1);
-    const k = Math.round((event.clientX - box.left - 20) / step);
-    const v = 1 - (event.clientY - box.top - 10) / (box.height - 40);
+    const at = pressed(event, this.canvas);
+    const step = (at.width - 40) / Math.max(1, this.axes.length - 1);
+    const k = Math.round((at.x - 20) / step);
+    const v = 1 - (at.y - 10) / (at.height - 40);
     return [Math.min(this.axes.length - 1, Math.max(0, k)), Math.min(1, Math.max(0, v))];
   }
   draw(axes, listed, colors, codes, ranges, titles) {
