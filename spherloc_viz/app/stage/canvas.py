@@ -76,6 +76,8 @@ class Canvas:
         self._lock = threading.Lock()
         self._picture: Picture | None = None
         self._walls: Walls | None = None
+        self._walls_came = False
+        """Whether there are walls that the view that was set last does not know."""
         client.camera.on_update(lambda camera: self._follow_page())
 
     def draw(self, run: Run, picture: Picture, mesh: bytes | None, movable: bool) -> None:
@@ -90,12 +92,13 @@ class Canvas:
             self._picture = picture
             solid = mesh if "mesh" in layers else None
             walls = Walls(solid, problem.aligned.map_turn) if solid is not None and len(solid) <= MAX_BYTES else None
-            walls_came, self._walls = walls is not None and self._walls is None, walls
+            self._walls_came |= walls is not None and self._walls is None
+            self._walls = walls
         if movable or self._movable:
             truth = problem.truth_cam_from_map
             self._camera.show(None if truth is None else problem.aligned.align_pose(truth), movable)
             self._movable = movable
-        self._move_viewer(run, picture, walls_came)
+        self._move_viewer(run, picture)
         self._make_room()
 
     def draw_map(self, label: str, scene: MapScene, mesh: bytes | None) -> None:
@@ -201,7 +204,7 @@ class Canvas:
         most = MAX_CHECKS if views.stands_at(self._client, views.START) else FIRST_CHECKS
         return CHECK_S if self._checks <= most else None
 
-    def _move_viewer(self, run: Run, picture: Picture, walls_came: bool) -> None:
+    def _move_viewer(self, run: Run, picture: Picture) -> None:
         """Set the view that the user chose or, if that is to follow the steps, the best view of the step's subject.
 
         The latter also if another scene was opened, which may be out of sight, and when its walls have arrived.
@@ -223,7 +226,7 @@ class Canvas:
             self._look_again(self._held[1])
         elif elsewhere or views.stands_at(self._client, views.START):
             self._look(None, picture)
-        elif self._looked is not None and (walls_came or same_name) and self._untouched():
+        elif self._looked is not None and (self._walls_came or same_name) and self._untouched():
             self._look(self._looked[0], picture)
         elif self._display.follow and (other_step or self._untouched()):
             self._follow_step(picture, other_step)
@@ -235,6 +238,7 @@ class Canvas:
         """
         aspect = self._aspect()
         if other_step:
+            self._walls_came = False
             view = views.follow(picture, aspect, self._walls, self._letter())
             if self._followed is None or not views.same(view, self._followed):
                 self._take(None, view, aspect)
@@ -251,7 +255,7 @@ class Canvas:
     def _look(self, name: str | None, picture: Picture) -> None:
         """Set the view of that name, or that of the step for None."""
         aspect = self._aspect()
-        walls = self._walls
+        walls, self._walls_came = self._walls, False
         wanted = (
             views.follow(picture, aspect, walls, self._letter())
             if name is None
@@ -277,7 +281,8 @@ class Canvas:
         return there or (not self._arrived and time.monotonic() - self._taken_s < MOVE_S)
 
     def _follow_page(self) -> None:
-        """Called on viser's threads when the page's viewer has moved or its canvas has another shape."""
+        """Called on viser's threads when the page's viewer has moved or its canvas has another shape. A slow page tells
+        late that the viewer has arrived: walls may have come meanwhile."""
         self._make_room()
         looked, picture = self._looked, self._picture
         if looked is None or picture is None:
@@ -286,7 +291,7 @@ class Canvas:
         if views.stands_at(self._client, views.START):  # a page that was still being built has dropped the view
             with self._lock:
                 self._take(*looked[:3])
-        elif looked[0] != HELD and self._is_reshaped(*looked[2:]) and untouched:
+        elif looked[0] != HELD and untouched and (self._walls_came or self._is_reshaped(*looked[2:])):
             with self._lock:
                 self._look(looked[0], picture)
 

@@ -1,0 +1,72 @@
+"""The picture of one page, on a real viser server and for a page without a browser."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import viser
+from test_app_views import box, glb
+
+from spherloc.datasets.synthetic import SyntheticScene
+from spherloc.estimators import default_options, estimate
+from spherloc_viz.app.catalog import Run, RunRequest, SceneRequest
+from spherloc_viz.app.controls.controls import DisplayControls
+from spherloc_viz.app.stage import canvas as stage
+from spherloc_viz.app.stage.canvas import Canvas
+from spherloc_viz.app.stage.walls import Walls
+from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
+from spherloc_viz.layers import paint, steps
+from tests.connected_page import HELLO, ConnectedPage
+from tests.waiting import until
+
+KEY = "a key of this test"
+
+
+@pytest.fixture
+def page() -> Iterator[ConnectedPage]:
+    server: viser.ViserServer = start_viser(KEY)
+    page = ConnectedPage(server, KEY)
+    yield page
+    page.close()
+    stop_viser(server)
+
+
+def test_a_page_that_arrives_late_sees_around_walls_that_came_meanwhile(
+    page: ConnectedPage, scene_of: Callable[..., SyntheticScene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = scene_of("panorama", correspondences=40, outlier_rate=0.3).problem()
+    request = RunRequest(SceneRequest("scene", 0), "mc", default_options("mc", problem))
+    run = Run(request, estimate(problem, "mc"), np.arange(len(problem)))
+    timeline = steps(run.trace)
+    picture = next(one for one in (paint(run.trace, k) for k in range(1, len(timeline))) if one.focus.view == "Sphere")
+    places: list[dict[str, Any]] = []
+    page.answer = lambda message: places.append(message) if message["type"].startswith("SetCamera") else None
+    shown = Canvas(page.handle, DisplayControls(page.handle.gui, print), lambda *_: None, lambda _: None, 0)
+
+    def placed(what: str) -> list[np.ndarray]:
+        return [np.array(place[what]) for place in places if what in place]
+
+    def stand(position: np.ndarray) -> None:
+        told = {"position": position.tolist(), "look_at": target.tolist(), "fov": float(page.handle.camera.fov)}
+        page.send(HELLO | told)
+
+    shown.draw(run, picture, None, False)
+    until(lambda: placed("look_at"))
+    (there,), (target,) = placed("position"), placed("look_at")
+    stand((there + HELLO["position"]) / 2)
+    until(lambda: not np.allclose(page.handle.camera.position, there))
+
+    monkeypatch.setattr(stage, "MOVE_S", 0.0)
+    subject = picture.focus.points
+    middle = subject.mean(axis=0)
+    half_m = 0.4 * float(np.linalg.norm(there - middle)) * np.array([1.0, 1.0, 0.1])
+    turn = problem.aligned.map_turn
+    wall = (middle + 0.6 * (there - middle)) @ turn  # in the map's frame, as a mesh is
+    mesh = glb(box(tuple(wall - half_m), tuple(wall + half_m)))
+    shown.draw(run, picture, mesh, False)
+    assert len(placed("position")) == 1, "a person may be moving it"
+    stand(there)
+    until(lambda: len(placed("position")) == 2)
+    walls = Walls(mesh, turn)
+    assert walls.blocked(there, subject) > 0.5 and walls.blocked(placed("position")[1], subject) < 0.2
