@@ -157,19 +157,19 @@ def read_gravity(table: Mapping[str, Any], where: str, bound_deg: float) -> Grav
     imu = None
     if "imu" in table:
         log = Path(where).parent / scene_file.text(table, "imu", section)
-        imu = ImuLog(log, read_imu(log), _rotation(table["camera_from_imu"], section))
+        imu = ImuLog(log, read_imu(log), camera_from_imu(table["camera_from_imu"], section))
     map_bound_deg = scene_file.number({"map_bound_deg": 0.0} | dict(table), "map_bound_deg", section, 0.0, 45.0)
     map_bound_rad = float(np.radians(map_bound_deg))
     return GravitySettings(bound_rad, sd_rad, query, file, stated, "bound_deg" in table, map_bound_rad, imu)
 
 
-def _rotation(value: Any, section: str) -> FloatArray:
-    """The key ``camera_from_imu`` (3, 3)."""
-    rotation = scene_file.numbers(value, (3, 3), "camera_from_imu", section)
+def camera_from_imu(value: Any, where: str) -> FloatArray:
+    """The rotation (3, 3) that is given ``where``; raises ``InputError`` if it is none."""
+    rotation = scene_file.numbers(value, (3, 3), "camera_from_imu", where)
     with np.errstate(over="ignore", invalid="ignore"):
         proper = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-3) and np.linalg.det(rotation) > 0
     if not proper:
-        raise InputError(f"{section}: camera_from_imu is not a rotation; give the 3 x 3 part of T_cam_imu.")
+        raise InputError(f"{where}: camera_from_imu is not a rotation; give the 3 x 3 part of T_cam_imu.")
     return rotation
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from spherloc.errors import InputError, SpherlocError, StoppedError, show
@@ -17,6 +17,7 @@ from spherloc.mapping.photographs import NewImages
 from spherloc.mapping.positions import Positions, gps_of_images
 from spherloc.mapping.reconstruction import DATABASES, reconstruct
 from spherloc.mapping.scene_files import SCENE
+from spherloc.mapping.stated_gravity import StatedGravity
 from spherloc.mapping.upright import (
     GravityByLines,
     Level,
@@ -60,7 +61,7 @@ class Map:
     scale: MapScale
     written: Written
     lines: GravityByLines
-    """Gravity of all photographs from their vertical lines."""
+    """Gravity of the photographs from their vertical lines, but for those of which a file states it."""
     groups: "tuple[Map, ...]" = ()
     """Maps of other images, which could not be joined with this one."""
     features: str = "sift"
@@ -68,6 +69,8 @@ class Map:
     carried_deg: float = 0.0
     """Half the opening angle of the cone around straight down that was left out, since what is in it moves with the
     camera; 0 if nothing was found."""
+    stated: Mapping[str, Gravity] = field(default_factory=dict)
+    """Gravity of photographs that a file states, by name."""
 
 
 def make_map(
@@ -81,21 +84,23 @@ def make_map(
     how: FrontendOptions | None = None,
     *,
     find_carried: bool = True,
+    stated: StatedGravity | None = None,
 ) -> Map:
     """Make a map of images of one camera or several and write it into ``folder``.
 
     For ``new_images``, a scene is written too; ``masks`` are the masks of the views, which are written into the scenes,
     and ``how`` says which features are matched. With ``find_carried``, what moves with the camera below panoramas is
-    found and left out, too. Raises ``InputError`` if the images give no map, if ``measured`` names other images, or if
-    a file cannot be read: then nothing is left in ``folder`` but what was there before. Raises ``StoppedError`` if a
-    file cannot be written: what is done is kept there and not done again.
+    found and left out, too; ``stated`` is gravity that a file states. Raises ``InputError`` if the images give no map,
+    if ``measured`` names other images, or if a file cannot be read: then nothing is left in ``folder`` but what was
+    there before. Raises ``StoppedError`` if a file cannot be written: what is done is kept there and not done again.
     """
     names = {view.name for view in views}
     for name in () if measured.distance is None else measured.distance[:2]:
         if name not in names:
             raise InputError(f"{show(name)} is not one of the {len(views)} photographs; give the names of two files.")
     with _folder_of_map(folder):
-        return _map_in(folder, views, images, measured, new_images, tell, masks, how, find_carried=find_carried)
+        what = folder, views, images, measured, new_images, tell, masks, how
+        return _map_in(*what, find_carried=find_carried, stated=stated)
 
 
 @contextmanager
@@ -135,6 +140,7 @@ def _map_in(
     how: FrontendOptions | None,
     *,
     find_carried: bool,
+    stated: StatedGravity | None,
 ) -> Map:
     """``make_map`` in a folder that is there."""
     if measured == ScaleMeasurement():
@@ -143,14 +149,15 @@ def _map_in(
     if carried_deg:
         views, _ = Masks(nadir_deg=carried_deg).on(views)
         masks = replace(masks or Masks(), nadir_deg=carried_deg)
-    kept = Kept(masks, how or FrontendOptions())
-    lines = gravity_by_lines(views, tell)
-    gravity = lines.found
+    kept = Kept(masks, how or FrontendOptions(), stated)
+    known = {} if stated is None else stated.found
+    lines = gravity_by_lines([view for view in views if view.name not in known], tell)
+    gravity = {**known, **lines.found}
     first, *others = reconstruct(views, [gravity.get(view.name) for view in views], folder, tell, how)
     found = _finished(first, views, nearer_to_others(first, others), gravity, measured, tell)
     inside = set(found[0].poses)
     written = write_map(*found, views, images, folder, new_images, kept)
-    made = Map(*found, written, lines, features=kept.how.features.method, carried_deg=carried_deg)
+    made = Map(*found, written, lines, features=kept.how.features.method, carried_deg=carried_deg, stated=known)
     groups: list[Map] = []
     for other in others:
         if len(other.poses.keys() - inside) < MIN_OF_GROUP:

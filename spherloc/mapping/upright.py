@@ -1,5 +1,6 @@
 """Gravity and scale of a model that was made from images alone."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from spherloc.errors import InputError, show
+from spherloc.frontend.gravity_from_lines import SOURCE as LINES
 from spherloc.frontend.gravity_from_lines import gravity_from_lines, why_not_found
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN, align_to_down, camera_centre
@@ -50,7 +52,7 @@ class Level:
     leaning: dict[str, float]
     """Angles, degrees, of images whose own gravity differs too much, by name: COLMAP placed them wrongly."""
     by_lines: bool = False
-    """Whether vertical lines of the images measured it."""
+    """Whether vertical lines of enough images measured it."""
 
 
 @dataclass(frozen=True)
@@ -105,15 +107,16 @@ def gravity_by_lines(views: Sequence[View], tell: Tell) -> GravityByLines:
 
 
 def level_of(poses: Mapping[str, FloatArray], gravity: Mapping[str, Gravity]) -> Level:
-    """Gravity of the model, from the vertical lines of the images, else as the mean of their vertical axes.
+    """Gravity of the model, from that of the images, else as the mean of their vertical axes.
 
-    ``poses`` (3, 4) are those of the registered images, by name, and ``gravity`` is that from vertical lines.
-    Raises ``InputError`` if the images do not agree.
+    ``poses`` (3, 4) are those of the registered images, by name, and ``gravity`` is that which a file states or
+    vertical lines show; a single image that a file states is enough. Raises ``InputError`` if the images do not agree.
     """
     axes = {name: pose[:, :3].T @ DOWN for name, pose in poses.items()}
     measured = {name: poses[name][:, :3].T @ one.down for name, one in gravity.items() if name in poses}
-    by_lines = len(measured) >= MIN_LINES
-    directions = measured if by_lines else axes
+    sources = Counter(gravity[name].source for name in measured)
+    is_measured = len(measured) >= MIN_LINES or sources[LINES] < len(measured)
+    directions = measured if is_measured else axes
     down = _middle(np.stack(list(directions.values())))
     off_deg = {name: float(np.degrees(np.arccos(min(1.0, one @ down)))) for name, one in directions.items()}
     spread_deg = float(np.median(list(off_deg.values())))
@@ -124,13 +127,17 @@ def level_of(poses: Mapping[str, FloatArray], gravity: Mapping[str, Gravity]) ->
         )
     limit_deg = max(MIN_LIMIT_DEG, LIMIT_SPREADS * spread_deg)
     leaning = {name: off for name, off in off_deg.items() if off > limit_deg}
-    source = f"vertical lines of {len(measured)} images"
-    if not by_lines:
+    told = (
+        f"{'vertical lines' if one == LINES else one} of {count} image{'s'[: count > 1]}"
+        for one, count in sources.items()
+    )
+    source = " and ".join(told)
+    if not is_measured:
         source = (
             f"the images' own vertical, as if held upright, since vertical lines show it in {len(measured)} of "
             f"{len(poses)} images and {MIN_LINES} are needed"
         )
-    return Level(down, source, spread_deg, leaning, by_lines)
+    return Level(down, source, spread_deg, leaning, sources[LINES] >= MIN_LINES)
 
 
 def _middle(directions: FloatArray) -> FloatArray:

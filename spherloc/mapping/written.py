@@ -24,6 +24,7 @@ from spherloc.mapping.scene_files import (
     toml_text,
     write_new_scene,
 )
+from spherloc.mapping.stated_gravity import StatedGravity
 from spherloc.mapping.upright import Level, MapScale, upright_frame
 from spherloc.registry import require
 from spherloc.types import FloatArray
@@ -56,6 +57,8 @@ class Kept:
     masks: Masks | None
     how: FrontendOptions
     """Features and matching."""
+    gravity: StatedGravity | None = None
+    """Gravity of photographs that a file states."""
 
 
 def write_map(
@@ -86,7 +89,7 @@ def write_map(
         _about(made, level, scale, len(views)),
         relative(images, folder),
         () if scale.source else (UNITS_UNKNOWN,),
-        (*_gravity(level), *_kept(kept, folder)),
+        (*_gravity(level, kept.gravity, folder), *_kept(kept, folder)),
     )
     try:
         (folder / MODEL).mkdir(parents=True, exist_ok=True)
@@ -118,11 +121,16 @@ def _name(images: Path, scale: MapScale) -> str:
     return images.resolve().name + ("" if scale.source else " (units unknown)")
 
 
-def _gravity(level: Level) -> list[str]:
+def _gravity(level: Level, stated: StatedGravity | None, folder: Path) -> list[str]:
     bound = max(MIN_BOUND_DEG, round(2.0 * level.spread_deg, 1))
     lines = ["", "[gravity]", "map = [0.0, 0.0, -1.0]", f"bound_deg = {bound}"]
     if level.by_lines:
         lines.append('query = "lines"                # where an image shows too few, gravity is that of its reference')
+    if stated is not None:
+        file = toml_text(relative(stated.file, folder))
+        lines.append(f"file = {file}" if stated.camera_from_imu is None else f"imu = {file}")
+        if stated.camera_from_imu is not None:
+            lines.append(f"camera_from_imu = {stated.camera_from_imu.tolist()}")
     return lines
 
 

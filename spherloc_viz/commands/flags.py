@@ -34,6 +34,10 @@ def _number(kind: Callable[[str], T], metavar: str, words: str) -> tyro.construc
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="STR", help_behavior_hint="")]
 OptionalNumber = Annotated[int | None, _number(int, "INT", "a whole number"), tyro.conf.arg(help_behavior_hint="")]
 OptionalFloat = Annotated[float | None, _number(float, "FLOAT", "a number"), tyro.conf.arg(help_behavior_hint="")]
+_Nine = tuple[float, float, float, float, float, float, float, float, float]
+OptionalRotation = Annotated[
+    _Nine | None, tyro.conf.arg(metavar="R11 R12 R13 R21 R22 R23 R31 R32 R33", help_behavior_hint="")
+]
 OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="")]
 """Types of optional flags, whose help would otherwise list None beside the type."""
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]

@@ -18,6 +18,7 @@ from spherloc_viz.commands.flags import (
     Flag,
     OptionalFloat,
     OptionalPath,
+    OptionalRotation,
     OptionalText,
     Settings,
 )
@@ -243,6 +244,8 @@ def map(
     camera_height: OptionalFloat = None,
     distance: Annotated[tuple[str, str, float] | None, arg(metavar="IMAGE IMAGE METRES", help_behavior_hint="")] = None,
     positions: OptionalPath = None,
+    gravity: OptionalPath = None,
+    camera_from_imu: OptionalRotation = None,
     mask: OptionalPath = None,
     nadir: OptionalFloat = None,
     seam: OptionalFloat = None,
@@ -275,6 +278,9 @@ def map(
         distance: Two images by name and the metres between them: gives the scale.
         positions: Where the images were taken, which gives the scale: rows of image x y z, a table with columns image,
             lat, lon, or a trajectory (TUM, EuRoC) if their names hold the time. GPS in the photographs needs no file.
+        gravity: Where down is in the photographs: rows of image gx gy gz [sd_deg], or with --camera-from-imu the log of
+            an IMU, if their names hold the time. Without it, and for other photographs, their vertical lines say it.
+        camera_from_imu: The rotation from the IMU's frame to the camera's, row by row.
         mask: An image that is black where a photograph may not be used, or a folder of them by the images' names.
         nadir: Leave out what is within so many degrees of straight down, such as the tripod; without it, what all
             panoramas show in the same direction down there is left out.
@@ -283,6 +289,9 @@ def map(
             extra is installed.
         localize: Folder of other images of that camera; a scene is written that localizes them in the map.
     """
+    import numpy as np
+
+    from spherloc.datasets.query_gravity import camera_from_imu as rotation_of
     from spherloc.frontend.masks import Masks
     from spherloc.mapping.make import ScaleMeasurement
     from spherloc_viz.commands.map import MAX_METRES, cameras_of_file, make
@@ -296,6 +305,9 @@ def map(
             raise InputError(f"{flag} is {metres:g}; give a positive number of metres.")
     if not 2 <= frames <= 500:
         raise InputError(f"--frames is {frames}; give a number from 2 to 500.")
+    if camera_from_imu is not None and gravity is None:
+        raise InputError("--camera-from-imu goes with --gravity FILE, the log of the IMU; give that file too.")
+    turn = None if camera_from_imu is None else rotation_of(np.reshape(camera_from_imu, (3, 3)).tolist(), str(gravity))
     taken = None if video is None else (video, frames)
     masked = any(one is not None for one in (mask, nadir, seam))
     masks = Masks(mask, nadir or 0.0, seam or 0.0) if masked else None
@@ -312,5 +324,6 @@ def map(
         masks=masks,
         find_carried=nadir is None,
         positions=positions,
+        gravity=None if gravity is None else (gravity, turn),
         features=features,
     )

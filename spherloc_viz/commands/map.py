@@ -32,8 +32,10 @@ from spherloc.mapping.advice import advice, for_a_page
 from spherloc.mapping.make import ScaleMeasurement, make_map
 from spherloc.mapping.photographs import NewImages, cameras_of, frames_of, new_images_of, photographs
 from spherloc.mapping.positions import read_positions
+from spherloc.mapping.stated_gravity import read_stated_gravity
 from spherloc.mapping.upright import Tell
 from spherloc.registry import require
+from spherloc.types import FloatArray
 from spherloc_viz.commands.map_report import MAP_FEATURES, map_report, summary
 from spherloc_viz.commands.progress import progress, say
 
@@ -58,14 +60,16 @@ def make(
     masks: Masks | None,
     find_carried: bool,
     positions: Path | None,
+    gravity: tuple[Path, FloatArray | None] | None,
     features: str | None,
 ) -> int:
     """Make the map, and print the result and what to do next; returns 1 if not all images are in it.
 
     ``cameras`` are those of the calibration file by name, ``video`` a file and a number of frames to take from it into
     ``folder``; with ``panorama``, images of 2 to 1 are panoramas in any case. With ``find_carried``, what moves with
-    the camera below panoramas is left out, too. ``positions`` is a file of where the images were taken, and
-    ``features`` one of ``MAP_FEATURES``, the best installed if None. Raises ``InputError``.
+    the camera below panoramas is left out, too. ``positions`` is a file of where the images were taken,
+    ``gravity`` one of their gravity, with the rotation (3, 3) from the IMU to the camera if it is the log of an IMU,
+    and ``features`` one of ``MAP_FEATURES``, the best installed if None. Raises ``InputError``.
     """
     end_without_a_trace()
     how = how_of(features)
@@ -76,7 +80,8 @@ def make(
         found = photographs(folder, cameras, masks, panorama)
         if positions is not None:
             measured = ScaleMeasurement(positions=read_positions(positions, found.views))
-        for remark in found.remarks:
+        stated = None if gravity is None else read_stated_gravity(*gravity, found.views)
+        for remark in (*found.remarks, *(() if stated is None else stated.remarks)):
             say(remark)
         others = None
         if new_images is not None:
@@ -85,7 +90,8 @@ def make(
                 say(f"{new_images}: {remark}")
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
         try:
-            made = make_map(found.views, folder, target, measured, others, tell, masks, how, find_carried=find_carried)
+            what = found.views, folder, target, measured, others, tell, masks, how
+            made = make_map(*what, find_carried=find_carried, stated=stated)
         except KeyboardInterrupt:
             say("stopped; what is done is kept, and the same command goes on from there.")
             raise

@@ -143,7 +143,7 @@ def map_report(made: Map, found: Photographs) -> str:
             "<h2>Not in the map</h2>" if left else "",
             *(_thumbnail(view, made, names) for view in left[:MAX_THUMBNAILS]),
             "<h2>Images</h2><table><tr><th>image</th><th>in the map</th><th>best partner</th><th>matches</th>"
-            "<th>gravity from its lines</th>"
+            "<th>gravity</th>"
             f"{'<th>off its position</th>' if made.scale.off_m else ''}</tr>",
             *rows,
             "</table></body></html>",
@@ -174,17 +174,18 @@ def _row(made: Map, names: list[str], index: int) -> str:
         f"<td{'' if inside else ' class=out'}>{'yes' if inside else 'no'}</td>",
         f"<td>{html.escape(names[best] if counts[best] else 'none')}</td>",
         f'<td class="number">{counts[best]:,}</td>',
-        f"<td>{html.escape(_lines_of(made, name))}</td>",
+        f"<td>{html.escape(_gravity_of(made, name))}</td>",
         _off(made, name),
     ]
     return f"<tr>{''.join(cells)}</tr>"
 
 
-def _lines_of(made: Map, name: str) -> str:
-    """What the lines of an image tell of gravity: its bound, or why they tell nothing."""
+def _gravity_of(made: Map, name: str) -> str:
+    """Where gravity of an image is from, and its bound, or why its lines tell nothing."""
     if name in made.lines.why_not:
-        return f"none: {made.lines.why_not[name]}"
-    return f"found, at most {np.degrees(made.lines.found[name].bound_rad or 0.0):.1f}° off"
+        return f"none from its lines: {made.lines.why_not[name]}"
+    known = made.stated.get(name) or made.lines.found[name]
+    return f"{known.source}, at most {np.degrees(known.bound_rad or 0.0):.1f}° off"
 
 
 def _off(made: Map, name: str) -> str:

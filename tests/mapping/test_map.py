@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -18,6 +19,7 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.datasets import bundled_scenes, load_scene
+from spherloc.datasets.query_gravity import read_gravity
 from spherloc.errors import CalibrationError, InputError
 from spherloc.formats.colmap_files import read_model
 from spherloc.frontend import trained
@@ -38,8 +40,11 @@ from spherloc.mapping.photographs import (
     two_circles,
 )
 from spherloc.mapping.scene_files import _camera, _queries
+from spherloc.mapping.stated_gravity import read_stated_gravity
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
+from spherloc.mapping.written import _gravity
 from spherloc.problem import Problem
+from spherloc_viz.commands.image_commands import map as map_command
 from spherloc_viz.commands.map import _kind, _sizes, cameras_of_file, how_of, main, scale_of_words
 from spherloc_viz.commands.map_report import map_report, summary
 from tests.waiting import LIMIT_S
@@ -126,6 +131,66 @@ def test_its_scenes_open(walk):
     assert len(read_model(output / "model").images) == 5
     for view in (scene.queries[0], scene.references[0], new.queries[0]):  # the mask of the map is that of the scenes
         assert not view.usable_pixels()[-1].any() and view.usable_pixels()[200].all()
+
+
+def test_gravity_that_a_file_states_goes_before_that_of_lines(walk, tmp_path):
+    poses, found, *_, output = walk
+    names = sorted(poses)
+    rows = [" ".join(map(str, (name, *(9.8 * poses[name][:, :3] @ [0, 0, -1]), 0.5))) for name in names[:3]]
+    (tmp_path / "gravity.txt").write_text("\n".join([*rows, "else.png 0 1 0"]))
+    stated = read_stated_gravity(tmp_path / "gravity.txt", None, found.views)
+    strange, without = stated.remarks
+    assert "1 of its 4 rows belong to none of the photographs, the first is else.png" in strange
+    assert "2 of 5 photographs have no gravity there, the first is reference_005.png" in without
+    shutil.copytree(output, tmp_path / "map")
+    images, nothing = found.views[0].path.parent, lambda *what: None
+    new = NewImages(images, None)
+    made = make_map(found.views, images, tmp_path / "map", ScaleMeasurement(), new, nothing, stated=stated)
+    assert made.level.source == "the gravity file of 3 images and vertical lines of 2 images"
+    assert sorted(made.stated) == names[:3] and sorted(made.lines.found) == names[3:]
+    page = map_report(made, found)
+    assert "<td>the gravity file, at most 1.5° off</td>" in page and "<td>lines of the image, at most " in page
+    for name in names:
+        lean = made.written.poses[name][:, :3] @ [0, 0, 1] @ (poses[name][:, :3] @ [0, 0, 1])
+        assert np.degrees(np.arccos(min(1.0, lean))) < 0.5
+    known = {view.name: view.gravity for view in load_scene(made.written.new_scene).queries}
+    assert [name for name in names if known[name] is not None] == names[:3]
+    assert known[names[0]].source == "the gravity file"
+    alone = level_of(made.written.poses, {names[1]: stated.found[names[1]]})
+    assert alone.source == "the gravity file of 1 image" and not alone.by_lines
+
+    (tmp_path / "none.txt").write_text("else.png 0 1 0")
+    with pytest.raises(InputError, match=r"none.txt: has gravity of none of the 5 photographs; name them as"):
+        read_stated_gravity(tmp_path / "none.txt", None, found.views)
+
+
+def test_the_log_of_an_imu_levels_a_map(walk, tmp_path):
+    """At rest its forces point up; the pictures were taken at the times in their names."""
+    _, found, *_ = walk
+    start = 1_625_133_000_000_000_000
+    turn = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    down = np.array([0.1, 0.99, 0.05])
+    force = -9.81 * turn.T @ down / np.linalg.norm(down)
+    rows = [f"{start + k * 10_000_000},0,0,0,{force[0]},{force[1]},{force[2]}" for k in range(1000)]
+    (tmp_path / "imu.csv").write_text("\n".join(rows))
+    views = [replace(view, name=f"{start + 10**9 * (1 + 3 * k)}.png") for k, view in enumerate(found.views)]
+    stated = read_stated_gravity(tmp_path / "imu.csv", turn, views)
+    assert list(stated.found) == [view.name for view in views[:3]], "the log has ten seconds"
+    for one in stated.found.values():
+        np.testing.assert_allclose(one.down, down / np.linalg.norm(down), atol=1e-3)
+        assert one.bound_rad == pytest.approx(np.radians(2.0)) and one.source == "the IMU"
+    (remark,) = stated.remarks
+    assert "imu.csv: 2 of 5 photographs have no gravity there" in remark
+    level = Level(np.array([0.0, 1.0, 0.0]), "the IMU of 3 images", 0.2, {})
+    lines = tomllib.loads("\n".join(_gravity(level, stated, tmp_path)))["gravity"]
+    settings = read_gravity({key: value for key, value in lines.items() if key != "map"}, str(tmp_path / "s.toml"), 2.0)
+    assert settings.imu is not None and np.array_equal(settings.imu.camera_from_imu, turn)
+    with pytest.raises(InputError, match="each needs a time in its name"):
+        read_stated_gravity(tmp_path / "imu.csv", turn, found.views)
+    with pytest.raises(InputError, match="--camera-from-imu goes with --gravity FILE"):
+        map_command(tmp_path, camera_from_imu=(0, -1, 0, 0, 0, -1, 1, 0, 0))
+    with pytest.raises(InputError, match=r"imu\.csv: camera_from_imu is not a rotation"):
+        map_command(tmp_path, gravity=tmp_path / "imu.csv", camera_from_imu=(0, -1, 0, 0, 0, -1, 2, 0, 0))
 
 
 def test_images_are_added_to_a_map_that_is_made(walk, tmp_path):
@@ -603,7 +668,9 @@ def test_why_lines_give_no_gravity_is_told_of_each_image(walk, tmp_path):
     """In the summary of the first one, in the report of each, and with the number that is needed for a map."""
     _, found, made, *_ = walk
     assert made.lines.found.keys() == made.written.poses.keys() and not made.lines.why_not
-    assert "no gravity" not in "".join(summary(made, found)) and "<td>found, at most " in map_report(made, found)
+    assert "no gravity" not in "".join(summary(made, found)) and "<td>lines of the image, at most " in map_report(
+        made, found
+    )
     name = sorted(made.lines.found)[1]
     assert cv2.imwrite(str(tmp_path / "blank.png"), np.full((200, 400), 90, np.uint8))
     blank = replace(found.views[1], path=tmp_path / "blank.png", camera=Equirectangular(400, 200), mask=None)
@@ -612,7 +679,7 @@ def test_why_lines_give_no_gravity_is_told_of_each_image(walk, tmp_path):
     assert lines.why_not == {name: "it has 0 straight edges, fewer than 5."}
     others = {key: value for key, value in made.lines.found.items() if key != name}
     told = replace(made, lines=replace(made.lines, found=others, why_not=lines.why_not))
-    assert f"<td>none: {lines.why_not[name]}</td>" in map_report(told, found)
+    assert f"<td>none from its lines: {lines.why_not[name]}</td>" in map_report(told, found)
     (said,) = [line for line in summary(told, found) if line.startswith("no gravity ")]
     assert said.endswith(f"the lines of 1 of 5 images (see the report), such as {name}: {lines.why_not[name]}")
     level = level_of(made.written.poses, lines.found)

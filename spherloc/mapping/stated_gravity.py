@@ -1,0 +1,63 @@
+"""Gravity of photographs that a file states: a vector for each, or the log of an IMU that is fixed to the camera."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from spherloc.datasets.imu import NAME_RULE, read_imu
+from spherloc.datasets.query_gravity import ImuLog, read_gravity_file
+from spherloc.errors import InputError, shorten
+from spherloc.frontend.view import Gravity, View
+from spherloc.types import FloatArray
+
+BOUND_RAD = float(np.radians(2.0))
+"""Bound on the error of a gravity that is stated without one."""
+
+
+@dataclass(frozen=True, eq=False)
+class StatedGravity:
+    """Gravity of some of the photographs, by name, and where it is from."""
+
+    found: Mapping[str, Gravity]
+    file: Path
+    camera_from_imu: FloatArray | None
+    """Rotation (3, 3) from the IMU's frame to the camera's; None if ``file`` is a gravity file."""
+    remarks: tuple[str, ...]
+    """Sentences on what does not fit together."""
+
+
+def read_stated_gravity(file: Path, camera_from_imu: FloatArray | None, views: Sequence[View]) -> StatedGravity:
+    """Gravity of ``views`` by a gravity file or, with a rotation ``camera_from_imu`` (3, 3), by the log of an IMU.
+
+    Raises ``InputError`` for a file that is none, and if it tells nothing of any of the views.
+    """
+    remarks: list[str] = []
+    if camera_from_imu is None:
+        rows, names = read_gravity_file(file), {view.name for view in views}
+        found = {name: one for name, one in rows.items() if name in names}
+        strange = [name for name in rows if name not in names]
+        rule = "name them as the folder does: image gx gy gz [sd_deg]"
+        if strange:
+            remarks.append(
+                f"{file}: {len(strange)} of its {len(rows)} rows belong to none of the photographs, the first is "
+                f"{shorten(strange[0])}."
+            )
+    else:
+        log = ImuLog(file, read_imu(file), camera_from_imu)
+        timed = log.with_gravity(tuple(replace(view, gravity=None) for view in views))
+        found = {view.name: view.gravity for view in timed if view.gravity is not None}
+        rule = f"each needs a time in its name ({NAME_RULE}), within the log"
+    without = [view.name for view in views if view.name not in found]
+    if not found:
+        raise InputError(f"{file}: has gravity of none of the {len(views)} photographs; {rule}.")
+    if without:
+        remarks.append(
+            f"{file}: {len(without)} of {len(views)} photographs have no gravity there, the first is "
+            f"{shorten(without[0])}; their vertical lines are searched."
+        )
+    for name, one in found.items():
+        if one.bound_rad is None:
+            found[name] = replace(one, bound_rad=BOUND_RAD)
+    return StatedGravity(found, file, camera_from_imu, tuple(remarks))
