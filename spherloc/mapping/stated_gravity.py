@@ -10,6 +10,7 @@ from spherloc.datasets.imu import NAME_RULE, read_imu
 from spherloc.datasets.query_gravity import ImuLog, read_gravity_file
 from spherloc.errors import InputError, shorten
 from spherloc.frontend.view import Gravity, View
+from spherloc.mapping.photographs import cameras_of
 from spherloc.types import FloatArray
 
 BOUND_RAD = float(np.radians(2.0))
@@ -31,7 +32,8 @@ class StatedGravity:
 def read_stated_gravity(file: Path, camera_from_imu: FloatArray | None, views: Sequence[View]) -> StatedGravity:
     """Gravity of ``views`` by a gravity file or, with a rotation ``camera_from_imu`` (3, 3), by the log of an IMU.
 
-    Raises ``InputError`` for a file that is none, and if it tells nothing of any of the views.
+    Raises ``InputError`` for a file that is none, if it tells nothing of any of the views, and for an IMU with several
+    cameras.
     """
     remarks: list[str] = []
     if camera_from_imu is None:
@@ -44,6 +46,11 @@ def read_stated_gravity(file: Path, camera_from_imu: FloatArray | None, views: S
                 f"{file}: {len(strange)} of its {len(rows)} rows belong to none of the photographs, the first is "
                 f"{shorten(strange[0])}."
             )
+    elif (count := len(cameras_of(views))) > 1:
+        raise InputError(
+            f"{file}: the photographs are of {count} cameras, each of which is turned otherwise to the IMU; give a "
+            "gravity file instead, with rows image gx gy gz [sd_deg]."
+        )
     else:
         log = ImuLog(file, read_imu(file), camera_from_imu)
         timed = log.with_gravity(tuple(replace(view, gravity=None) for view in views))

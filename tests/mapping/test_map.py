@@ -187,6 +187,9 @@ def test_the_log_of_an_imu_levels_a_map(walk, tmp_path):
     assert settings.imu is not None and np.array_equal(settings.imu.camera_from_imu, turn)
     with pytest.raises(InputError, match="each needs a time in its name"):
         read_stated_gravity(tmp_path / "imu.csv", turn, found.views)
+    several = [replace(views[0], camera=Equirectangular(400, 200)), *views[1:]]
+    with pytest.raises(InputError, match="are of 2 cameras, each of which is turned otherwise to the IMU"):
+        read_stated_gravity(tmp_path / "imu.csv", turn, several)
     with pytest.raises(InputError, match="--camera-from-imu goes with --gravity FILE"):
         map_command(tmp_path, camera_from_imu=(0, -1, 0, 0, 0, -1, 1, 0, 0))
     with pytest.raises(InputError, match=r"imu\.csv: camera_from_imu is not a rotation"):
