@@ -57,7 +57,7 @@ def test_every_preset_shows_what_its_story_says(tab: Playground) -> None:
     assert list(offered) == list(OUTCOMES) == [recipe.title for recipe in RECIPES]
     for title, preset in offered.items():
         tab.choose("Preset", title)
-        expect(tab.page.get_by_text(preset.story, exact=True)).to_be_visible()
+        expect(tab.page.get_by_text(f"{preset.story} Estimator: {preset.estimator}.", exact=True)).to_be_visible()
         expect(tab.value("estimator")).to_have_text(preset.estimator)
         expect(tab.value("outcome")).to_have_text(OUTCOMES[title])
         trace = estimate(catalog.problem(preset.scene), preset.estimator, preset.options, preset.scene.seed)
