@@ -11,6 +11,8 @@ from spherloc.geometry import camera_centre, yaw_rotation
 from spherloc.registry import names
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
+from spherloc_viz.app.catalog import Catalog
+from spherloc_viz.app.controls.presets import presets
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.painter import LABEL_SCALE
 from spherloc_viz.layers import paint, steps
@@ -116,6 +118,27 @@ def test_balls_are_large_enough_to_be_seen(aspect: float) -> None:
                 over = on_screen(views.Viewpoint(place[0], target[0]), shown.centers, aspect)[:, 1]
                 reach = shown.radii_m / depth / np.tan(views.FIELD_OF_VIEW_RAD / 2)
                 assert np.all(np.abs(over) + reach < 1.15), heading.key
+
+
+@pytest.mark.parametrize("title", ["Horizontal bearings", "Repeated facades", "RANSAC bad luck"])
+def test_the_balls_of_a_clique_fill_the_canvas_and_are_whole(title: str) -> None:
+    """Also if the radii of the clique go from 14 cm to 32 m, as with points that are all as high as the camera."""
+    catalog = Catalog(None)
+    preset = next(preset for preset in presets(catalog) if preset.title == title)
+    trace = estimate(catalog.problem(preset.scene), "mc")
+    cliques = [index for index, heading in enumerate(steps(trace)) if re.fullmatch(r"clique(-\d+)?", heading.key)]
+    assert len(cliques) >= 2
+    for index in cliques:
+        picture = paint(trace, index)
+        [balls] = [item for item in picture.scene if item.name == "balls/clique"]
+        assert isinstance(balls, Balls)
+        size = re.fullmatch(r"clique-(\d+)", picture.step.key)
+        assert len(balls.radii_m) == min(int(size[1]), 10) if size else len(balls.radii_m) == 10
+        view = views.follow(picture, ASPECTS[1])
+        depth = np.linalg.norm(balls.centers - view.position, axis=1)
+        heights = balls.radii_m / depth / np.tan(view.field_of_view_rad / 2)
+        assert np.all(np.abs(on_screen(view, balls.centers, ASPECTS[1])[:, 1]) + heights < 1.25), picture.step.key
+        assert heights.max() > 0.5, picture.step.key
 
 
 def test_steps_about_one_thing_are_seen_from_one_side(trace: Trace) -> None:

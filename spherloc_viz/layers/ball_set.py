@@ -11,7 +11,7 @@ from spherloc.geometry import camera_centre
 from spherloc.trace import TranslationStage
 from spherloc.types import FloatArray, IntArray
 from spherloc_viz import style
-from spherloc_viz.layers.frame import RunView, ball_boxes, even, level_circles, one_color
+from spherloc_viz.layers.frame import RunView, ball_boxes, even, level_circles, one_color, sphere_box
 from spherloc_viz.layers.primitives import Balls, Focus, Points, SceneItem, Segments
 from spherloc_viz.layers.ring import GOLDEN
 
@@ -19,6 +19,10 @@ OPACITIES = ((4, 0.3), (np.inf, 0.2))
 """Largest number of surfaces, and their opacity: few balls are seen well, and many do not hide things behind them."""
 MAX_SURFACES = 10
 """If there are more balls, the others are drawn as circles."""
+ROOM = 1.3
+"""Reach around a ball of a clique that is on the screen, by its radius: what is around the clique is seen as well."""
+LARGE = 3.0
+"""A ball that is larger than this many times the median of a few hides them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,17 +59,23 @@ class BallSet:
         """The ball that serves as an example."""
         return int(self.order[0])
 
-    def focus(self, shown: IntArray) -> Focus:
-        """These balls, the smallest first, as far as they are drawn, or the denser half of many, from the side from
-        which most of the clique is seen."""
-        drawn = self.drawn(shown, self.mask(shown))
-        return Focus("Balls", ball_boxes(self.stage.centres_m[drawn], self.stage.radii_m[drawn]), self._clique_box)
+    def focus(self, shown: IntArray, inside: NDArray[np.bool_]) -> Focus:
+        """What `items` draws: the surfaces of a clique, a mask (M,), or the denser half of balls that are none, from
+        the side from which most of the maximum clique is seen."""
+        return Focus("Balls", self._box(shown, inside), self._clique_box)
 
     @cached_property
     def _clique_box(self) -> FloatArray:
-        members = self.members if len(self.members) else self.by_radius
-        drawn = self.drawn(members, self.mask(members))
-        return ball_boxes(self.stage.centres_m[drawn], self.stage.radii_m[drawn])
+        return self._box(self.by_radius, self.in_clique)
+
+    def _box(self, shown: IntArray, inside: NDArray[np.bool_]) -> FloatArray:
+        drawn = self.drawn(shown, inside)
+        if not inside[drawn].any():
+            return ball_boxes(self.stage.centres_m[drawn], self.stage.radii_m[drawn])
+        # Balls of a clique are all at one place, and its large ones, drawn as circles, reach far around it.
+        chosen = self.solid(drawn, inside) & inside
+        boxes = zip(self.stage.centres_m[chosen], self.stage.radii_m[chosen], strict=True)
+        return np.vstack([sphere_box(centre, ROOM * radius_m) for centre, radius_m in boxes])
 
     @cached_property
     def in_clique(self) -> NDArray[np.bool_]:
@@ -126,13 +136,22 @@ class BallSet:
 
     def drawn(self, shown: IntArray, inside: NDArray[np.bool_]) -> IntArray:
         """The balls to draw, of some balls with the smallest first: if there are too many, an even sample of the
-        smaller half of those of a mask (M,) and of the others. Large balls would contain and hide the whole picture."""
+        smaller ones of a mask (M,) and of the others. Large balls would contain and hide the whole picture."""
         most = style.MAX_DRAWN_BALLS
         if len(shown) <= most:
             return shown
-        halves = [group[: max(1, len(group) // 2)] for group in (shown[inside[shown]], shown[~inside[shown]])]
+        chosen, others = shown[inside[shown]], shown[~inside[shown]]
+        halves = chosen[: self._smaller(chosen)], others[: max(1, len(others) // 2)]
         take = min(len(halves[0]), max(most // 2, most - len(halves[1])))
         return np.concatenate([even(halves[0], take), even(halves[1], most - take)])
+
+    def _smaller(self, balls: IntArray) -> int:
+        """How many of some balls, the smallest first, are the smaller ones: half of many, and all of a few that do not
+        stand out by their size."""
+        if len(balls) == 0:
+            return 0
+        radii = self.stage.radii_m[balls]
+        return max(len(balls) // 2, min(MAX_SURFACES, np.count_nonzero(radii <= LARGE * np.median(radii))))
 
     def solid(self, drawn: IntArray, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Mask (M,) of the balls with a surface: some of the smaller half of the drawn ones of a mask (M,), or of all

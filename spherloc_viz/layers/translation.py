@@ -11,7 +11,7 @@ from spherloc.trace import TranslationStage
 from spherloc.types import FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers.ball_set import BallSet
-from spherloc_viz.layers.frame import Frame, Plan, RunView, ball_boxes, growing, one_color
+from spherloc_viz.layers.frame import Frame, Plan, RunView, growing, one_color, sphere_box
 from spherloc_viz.layers.graph_nodes import ball_nodes, ball_rows, graph_at
 from spherloc_viz.layers.primitives import Balls, Focus, Graph, Label, Segments
 
@@ -126,7 +126,7 @@ def _pair(view: RunView, balls: BallSet) -> Frame:
             Segments("pairs/rays", "pairs", ends, one_color(style.SAMPLE, 2), 2.0),
             _name(centre, radius_m, "ball: all camera positions that this pair allows"),
         ),
-        focus=Focus("Balls", np.vstack([ball_boxes(centre[None], NAME_ROOM * stage.radii_m[ball]), ends[:, 0]])),
+        focus=Focus("Balls", np.vstack([sphere_box(centre, NAME_ROOM * radius_m), ends[:, 0]])),
     )
 
 
@@ -156,7 +156,7 @@ def _some(view: RunView, balls: BallSet, size: int) -> Frame:
         view.no_matches(),
         note=f"Smaller balls come first, spread evenly over them. {_note(balls, shown, inside)}",
         items=items,
-        focus=balls.focus(shown),
+        focus=balls.focus(shown, inside),
     )
 
 
@@ -171,7 +171,7 @@ def _all(view: RunView, balls: BallSet) -> Frame:
         view.no_matches(),
         note=_note(balls, balls.by_radius, inside),
         items=balls.items(view, balls.by_radius, inside),
-        focus=balls.focus(balls.by_radius),
+        focus=balls.focus(balls.by_radius, inside),
     )
 
 
@@ -200,7 +200,7 @@ def _greedy(view: RunView, balls: BallSet, found: IntArray, first: str, then: st
         view.no_matches(),
         note=_note(balls, balls.by_radius, inside),
         items=balls.items(view, balls.by_radius, inside, style.SAMPLE),
-        focus=balls.focus(balls.by_radius[inside[balls.by_radius]]),
+        focus=balls.focus(balls.by_radius, inside),
     )
 
 
@@ -220,7 +220,7 @@ def _members(view: RunView, balls: BallSet, size: int) -> Frame:
         view.no_matches(),
         note=_note(balls, balls.by_radius, inside),
         items=balls.items(view, balls.by_radius, inside),
-        focus=balls.focus(chosen),
+        focus=balls.focus(balls.by_radius, inside),
     )
 
 
@@ -245,13 +245,13 @@ def _clique(view: RunView, balls: BallSet) -> Frame:
         located=True,
         sphere_aside=True,
         items=(*balls.items(view, balls.by_radius, balls.in_clique), _clique_name(balls)),
-        focus=balls.focus(balls.members),
+        focus=balls.focus(balls.by_radius, balls.in_clique),
     )
 
 
 def _clique_name(balls: BallSet) -> Label:
     """A label above the clique."""
-    points = balls.focus(balls.members).points
+    points = balls.focus(balls.by_radius, balls.in_clique).points
     place = np.mean(points, axis=0)
     place[1] = np.min(points[:, 1])
     return Label("balls/name", "balls", place, "maximum clique: most balls that all overlap each other")
