@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import ceil
 from pathlib import Path
 
@@ -39,6 +39,10 @@ BLACK = 16
 SHARPNESS_PX = 512
 """Frames are scaled to this longer side before their sharpness is compared."""
 
+LensFinder = Callable[[Sequence[Path], tuple[int, int]], tuple[Camera, str]]
+"""Calibrates a lens by images that it took, all of a size (width, height), and says how in a sentence; raises
+``InputError`` with a part of a sentence if they do not tell it."""
+
 
 @dataclass(frozen=True)
 class Photographs:
@@ -48,6 +52,8 @@ class Photographs:
     remarks: tuple[str, ...]
     cameras: Mapping[str, Camera]
     """The calibrations that were given or found, by name or by the folder of their images."""
+    calibrated: Mapping[str, Camera] = field(default_factory=dict)
+    """Those that the images themselves told, by their folder in that of the map; empty for that itself."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +66,17 @@ class NewImages:
 
 
 def photographs(
-    folder: Path, cameras: Mapping[str, Camera], masks: Masks | None = None, panorama: bool = False
+    folder: Path,
+    cameras: Mapping[str, Camera],
+    masks: Masks | None = None,
+    panorama: bool = False,
+    find_lens: LensFinder | None = None,
 ) -> Photographs:
     """The images from which a map can be made: ``with_cameras``, without the pixels that ``masks`` leave out.
 
     Raises ``InputError`` as that does, and if there are fewer than two images or too many, or if no image has a mask.
     """
-    found = with_cameras(folder, cameras, panorama)
+    found = with_cameras(folder, cameras, panorama, find_lens)
     views, remarks = found.views, found.remarks
     if len(views) < MIN_IMAGES:
         raise InputError(
@@ -81,17 +91,20 @@ def photographs(
     if masks is None:
         return found
     masked, without = masks.on(views)
-    return Photographs(tuple(masked), (*remarks, *without), found.cameras)
+    return Photographs(tuple(masked), (*remarks, *without), found.cameras, found.calibrated)
 
 
-def with_cameras(folder: Path, cameras: Mapping[str, Camera], panorama: bool = False) -> Photographs:
+def with_cameras(
+    folder: Path, cameras: Mapping[str, Camera], panorama: bool = False, find_lens: LensFinder | None = None
+) -> Photographs:
     """The images of a folder or, if it has none, of the folders in it, with their cameras.
 
     ``cameras`` are those of a calibration file, by name; without them, calibrations beside the images are taken, and
     for a folder in ``folder`` also one beside it that has its name, or a file there with several cameras. A single
     camera is that of all images. Of several with the size of an image it is the one whose name is in the image's name,
     or that of its folder; a camera that has only a number is that of the folder with this number. Images of 2 to 1
-    count as panoramas where no camera has their size, and if ``panorama`` in any case.
+    count as panoramas where no camera has their size, and if ``panorama`` in any case. If no camera is known of the
+    images of a folder, ``find_lens`` calibrates that of those of one size, the most frequent.
 
     Raises ``InputError`` if the folder has no photographs, if their camera is unknown, or if it has no model in COLMAP.
     """
@@ -102,9 +115,11 @@ def with_cameras(folder: Path, cameras: Mapping[str, Camera], panorama: bool = F
     views: list[View] = []
     remarks: list[str] = []
     known = dict(cameras)
+    calibrated: dict[str, Camera] = {}
     if any(is_image(name) for name in there) or not inside:
         known = known or _beside(folder, "")
-        views, remarks = _of_folder(folder, "", cameras, known, panorama)
+        views, remarks, lens = _of_folder(folder, "", cameras, known, panorama, find_lens)
+        calibrated |= {} if lens is None else {"": lens}
         remarks += _about_subfolders(inside)
     else:
         folders = sorted(inside)
@@ -112,14 +127,16 @@ def with_cameras(folder: Path, cameras: Mapping[str, Camera], panorama: bool = F
         for name in folders:
             try:
                 given, common = (_belonging(some, name, folders) for some in (cameras, shared))
-                found, about = _of_folder(folder, name, given, _beside(folder, name) or common, panorama)
+                beside = _beside(folder, name) or common
+                found, about, lens = _of_folder(folder, name, given, beside, panorama, find_lens)
+                calibrated |= {} if lens is None else {name: lens}
             except InputError as error:
                 found, about = [], [f"It is left out: {error}"]
             views += found
             if len(cameras_of(found)) == 1:
                 known[name] = found[0].camera
             remarks += [f"{shorten(name)}: {remark}" for remark in about]
-    return Photographs(tuple(views), tuple(remarks), known)
+    return Photographs(tuple(views), tuple(remarks), known, calibrated)
 
 
 def cameras_of(views: Sequence[View]) -> dict[str, Camera]:
@@ -178,9 +195,15 @@ def _belonging(cameras: Mapping[str, Camera], folder: str, folders: Sequence[str
 
 
 def _of_folder(
-    root: Path, inside: str, given: Mapping[str, Camera], beside: Mapping[str, Camera], panorama: bool
-) -> tuple[list[View], list[str]]:
-    """The images of the folder ``inside`` of ``root``, or of ``root`` itself if that is empty, and remarks on others.
+    root: Path,
+    inside: str,
+    given: Mapping[str, Camera],
+    beside: Mapping[str, Camera],
+    panorama: bool,
+    find_lens: LensFinder | None,
+) -> tuple[list[View], list[str], Camera | None]:
+    """The images of the folder ``inside`` of ``root``, or of ``root`` itself if that is empty, remarks on others, and
+    the camera that ``find_lens`` found, if it was needed.
 
     ``given`` are the cameras that the user gave, ``beside`` those of files beside the images. Raises ``InputError`` if
     it has no images, or if their camera is unknown or has no model in COLMAP.
@@ -213,14 +236,22 @@ def _of_folder(
     if used and not given:
         remarks.append(f"The calibration found beside them: {', '.join(map(shorten, used))}.")
     rest = sorted(name for names in sizes.values() for name in names if name not in camera_of)
+    lens = None
     if rest and not camera_of and not given:
         order = sorted(sizes, key=lambda size: -len(sizes[size]))
         told = ", ".join(f"{len(sizes[size])} of {size[0]} x {size[1]} pixels" for size in order[:MAX_NAMED])
         files = "their calibration" if len(sizes) == 1 else "a file with the calibrations of all of them"
-        raise InputError(
-            f"{folder}: its photographs, {told}, are not full panoramas (2 to 1); "
-            f"{advice('calibration').format(files=files)}."
-        )
+        known = advice("calibration").format(files=files)
+        unknown = f"{folder}: its photographs, {told}, are not full panoramas (2 to 1)"
+        if find_lens is None:
+            raise InputError(f"{unknown}; {known}.")
+        try:
+            lens, how = find_lens([folder / name for name in sizes[order[0]]], order[0])
+        except InputError as error:
+            raise InputError(f"{unknown} and have no calibration, and {error}; else {known}.") from None
+        camera_of = dict.fromkeys(sizes[order[0]], lens)
+        rest = [name for name in rest if name not in camera_of]
+        remarks.append(how)
     if rest:
         width, height = next(size for size, names in sizes.items() if rest[0] in names)
         remarks.append(
@@ -236,7 +267,7 @@ def _of_folder(
         View((Path(inside) / name).as_posix(), for_model[repr(camera_of[name])], folder / name)
         for name in sorted(camera_of)
     ]
-    return views, remarks
+    return views, remarks, lens
 
 
 def _with_cameras(

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,8 @@ MODEL = "model"
 """Folder of COLMAP's model in that of the map."""
 SCENE = "scene.toml"
 """Scene file of the map's own images."""
+LENS = "lens.toml"
+"""Calibration file of a lens that the map's images told."""
 UNITS_UNKNOWN = 'units = "unknown"             # lengths are told in units of the map'
 EVERY = 4
 """Every fourth image of the map is a query of the scene file, localized against the others."""
@@ -92,6 +94,13 @@ def _names(names: Sequence[str]) -> str:
 
 def _camera(camera: Camera) -> list[str]:
     return [f"{key} = {toml_value(value)}" for key, value in camera.to_dict().items()]
+
+
+def write_lenses(folder: Path, cameras: Mapping[str, Camera]) -> None:
+    """Write calibration files of cameras by name: ``lens.toml`` of that without one. Raises ``OSError``."""
+    for name, camera in cameras.items():
+        path = folder / (f"lens_{name}.toml" if name else LENS)
+        path.write_text("\n".join(["[camera]", *_camera(camera)]) + "\n", encoding="utf-8")
 
 
 def write_new_scene(head: MapHead, folder: Path, new_images: NewImages, camera: Camera) -> Path:

@@ -29,9 +29,18 @@ from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.images import read_size
 from spherloc.mapping.advice import advice, for_a_page
-from spherloc.mapping.make import ScaleMeasurement, make_map
-from spherloc.mapping.photographs import NewImages, cameras_of, frames_of, new_images_of, photographs
+from spherloc.mapping.make import Map, ScaleMeasurement, make_map
+from spherloc.mapping.photographs import (
+    LensFinder,
+    NewImages,
+    Photographs,
+    cameras_of,
+    frames_of,
+    new_images_of,
+    photographs,
+)
 from spherloc.mapping.positions import read_positions
+from spherloc.mapping.scene_files import LENS, write_lenses
 from spherloc.mapping.stated_gravity import read_stated_gravity
 from spherloc.mapping.upright import Tell
 from spherloc.registry import require
@@ -77,7 +86,7 @@ def make(
     with _stages() as tell, _compiled_for(new_images):
         if video is not None:
             _take_frames(*video, folder, tell)
-        found = photographs(folder, cameras, masks, panorama)
+        found = photographs(folder, cameras, masks, panorama, _lens_finder(tell))
         if positions is not None:
             measured = ScaleMeasurement(positions=read_positions(positions, found.views))
         stated = None if gravity is None else read_stated_gravity(*gravity, found.views)
@@ -97,11 +106,13 @@ def make(
             raise
     report = target / REPORT
     try:
-        report.write_text(map_report(made, found), encoding="utf-8")
+        _write(report, made, found)
     except OSError as error:
         raise StoppedError(_unwritten(report, error)) from None
     print("\n".join(summary(made, found)))
     print(f"report        {report}")
+    if "" in found.calibrated:
+        print(f"lens          {target / LENS}, for other images of that camera: --camera {target / LENS}")
     if others is not None:
         print(f"new images    {_sizes(others)}")
     scene = made.written.new_scene or made.written.scene
@@ -110,6 +121,21 @@ def make(
     for group in made.groups if others is not None else ():
         print(f"or there      spherloc localize {group.written.new_scene}")
     return 0 if len(made.written.poses) == len(found.views) else 1
+
+
+def _lens_finder(tell: Tell) -> LensFinder:
+    def find(paths: Sequence[Path], size: tuple[int, int]) -> tuple[Camera, str]:
+        from spherloc.mapping.unknown_lens import find_lens
+
+        return find_lens(paths, size, tell)
+
+    return find
+
+
+def _write(report: Path, made: Map, found: Photographs) -> None:
+    """Write the report of a map, and the calibrations that its images told beside it; raises ``OSError``."""
+    report.write_text(map_report(made, found), encoding="utf-8")
+    write_lenses(report.parent, found.calibrated)
 
 
 def _unwritten(report: Path, error: OSError) -> str:
@@ -234,10 +260,10 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
     report = output / REPORT
     with for_a_page():
         try:
-            found = photographs(folder, {})
+            found = photographs(folder, {}, find_lens=_lens_finder(_progress))
             measured = scale_of_words(scale)
             made = make_map(found.views, folder, output, measured, None, _progress, how=how_of())
-            report.write_text(map_report(made, found), encoding="utf-8")
+            _write(report, made, found)
         except SpherlocError as error:
             _tell({"error": str(error)})
             return 1

@@ -151,7 +151,7 @@ class BallSet:
         if len(balls) == 0:
             return 0
         radii = self.stage.radii_m[balls]
-        return max(len(balls) // 2, min(MAX_SURFACES, np.count_nonzero(radii <= LARGE * np.median(radii))))
+        return max(len(balls) // 2, min(MAX_SURFACES, int(np.count_nonzero(radii <= LARGE * np.median(radii)))))
 
     def solid(self, drawn: IntArray, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Mask (M,) of the balls with a surface: some of the smaller half of the drawn ones of a mask (M,), or of all

@@ -1,0 +1,195 @@
+"""Fisheyes without a calibration: their image circle, their lens by matches, and what is said where those do not do."""
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from spherloc import registry
+from spherloc.cameras.calibration import load_camera
+from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.datasets import load_scene
+from spherloc.errors import InputError
+from spherloc.geometry import so3_exp
+from spherloc.mapping.image_circle import image_circle
+from spherloc.mapping.lens_fit import Circle, Lens, fit_lens
+from spherloc.mapping.photographs import photographs
+from spherloc.mapping.scene_files import LENS, write_lenses
+from spherloc.mapping.unknown_lens import MAX_OFF_RAD, find_lens
+
+TRUE = KannalaBrandt(900, 700, 270.0, 270.0, 458.0, 343.0, (-1 / 24, 1 / 1920, 0.0, 0.0))
+RIM = Circle(450.0, 350.0, float(np.hypot(450, 350)))
+
+
+def matched(rng: np.random.Generator, *, turned: bool) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Matches of twelve pairs of images, a fifth of them wrong, with noise of 0.3 px."""
+    pairs = []
+    for _ in range(12):
+        points = rng.uniform((-6.0, -6.0, -4.0), (6.0, 6.0, 8.0), (600, 3))
+        turn = so3_exp(rng.normal(0.0, 0.3, 3)) if turned else np.eye(3)
+        move = rng.normal(0.0, 0.5, 3) if turned else np.array([0.0, 0.0, -rng.uniform(0.5, 1.0)])
+        seen, inside = zip(*(TRUE.project(place) for place in (points, points @ turn.T + move)), strict=True)
+        both = inside[0] & inside[1]
+        for pixels in seen:
+            both &= np.all((pixels > 0) & (pixels < (TRUE.width, TRUE.height)), axis=1)
+        first, second = (pixels[both] + rng.normal(0.0, 0.3, (np.count_nonzero(both), 2)) for pixels in seen)
+        wrong = rng.random(len(first)) < 0.2
+        second[wrong] = rng.uniform((0, 0), (TRUE.width, TRUE.height), (np.count_nonzero(wrong), 2))
+        pairs.append((first[:150], second[:150]))
+    return pairs
+
+
+def angles(lens: Lens | KannalaBrandt, radii: np.ndarray) -> np.ndarray:
+    pixels = np.column_stack([lens.cx + radii, np.full(len(radii), lens.cy)])
+    rays = lens.bearings(pixels)[0] if isinstance(lens, Lens) else lens.unproject(pixels)[0]
+    return np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+
+
+def test_a_lens_is_found_by_matches(rng):
+    pycolmap = registry.require("pycolmap", "colmap", "a test")
+    fit, off_rad = fit_lens(pycolmap, matched(rng, turned=True), RIM, is_circle=False)
+    radii = np.linspace(0.0, 450.0, 10)
+    assert np.degrees(np.abs(angles(fit.lens, radii) - angles(TRUE, radii)).max()) < 0.3
+    assert np.hypot(fit.lens.cx - TRUE.cx, fit.lens.cy - TRUE.cy) < 2.0
+    assert np.degrees(off_rad) < 0.5
+    assert 0.6 * 12 * 150 < fit.matches < 0.9 * 12 * 150
+
+
+def test_a_camera_that_only_went_straight_ahead_does_not_tell_its_lens(rng):
+    pycolmap = registry.require("pycolmap", "colmap", "a test")
+    _, off_rad = fit_lens(pycolmap, matched(rng, turned=False), RIM, is_circle=False)
+    assert off_rad > MAX_OFF_RAD
+
+
+def test_bearings_of_a_lens_and_their_slopes(rng):
+    lens = Lens(270.0, 458.0, 343.0, -1 / 24, 1 / 1920)
+    pixels = rng.uniform((0, 0), (900, 700), (200, 2))
+    rays, outwards, sideways = lens.bearings(pixels)
+    np.testing.assert_allclose(rays, TRUE.unproject(pixels)[0], atol=1e-9)
+    out = pixels - (lens.cx, lens.cy)
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    for way, slope in ((out, outwards), (np.column_stack([-out[:, 1], out[:, 0]]), sideways)):
+        np.testing.assert_allclose((lens.bearings(pixels + 1e-3 * way)[0] - rays) / 1e-3, slope, atol=1e-5)
+
+
+def circular(rng: np.random.Generator, size: tuple[int, int], centre: tuple[float, float], radius: float) -> np.ndarray:
+    """A picture that is dark outside of a circle, but for noise."""
+    columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    image = rng.integers(30, 255, (size[1], size[0])).astype(np.uint8)
+    outside = np.hypot(columns + 0.5 - centre[0], rows + 0.5 - centre[1]) > radius
+    image[outside] = rng.integers(0, 8, np.count_nonzero(outside))
+    return image
+
+
+@pytest.mark.parametrize("radius", [190.0, 260.0])
+def test_an_image_circle_is_found(rng, radius):
+    """Also one that the image cuts above and below, and though part of it is dark in one of the images."""
+    images = [circular(rng, (640, 480), (330.0, 236.0), radius) for _ in range(3)]
+    images[0][:, 300:] = 0
+    circle = image_circle(images)
+    assert circle is not None
+    assert np.hypot(circle.x - 330.0, circle.y - 236.0) < 1.5 and abs(circle.radius - radius) < 2.5
+
+
+def test_an_image_without_a_circle_has_none(rng):
+    full = rng.integers(30, 255, (480, 640)).astype(np.uint8)
+    dark = np.zeros((480, 640), np.uint8)
+    window = dark.copy()
+    window[150:300, 200:420] = 200
+    assert image_circle([full]) is None and image_circle([dark]) is None and image_circle([window]) is None
+    assert image_circle([]) is None
+
+
+def test_photographs_without_a_calibration_are_given_the_lens_that_they_tell(tmp_path, rng):
+    for name in ("1.png", "2.png", "3.png"):
+        cv2.imwrite(str(tmp_path / name), rng.integers(0, 255, (300, 400), dtype=np.uint8))
+    cv2.imwrite(str(tmp_path / "other.png"), rng.integers(0, 255, (300, 300), dtype=np.uint8))
+    lens = KannalaBrandt(400, 300, 90.0, 90.0, 200.0, 150.0, (0.01, 0.0, 0.0, 0.0))
+    asked = []
+
+    def finds(paths: list[Path], size: tuple[int, int]) -> tuple[KannalaBrandt, str]:
+        asked.append(([path.name for path in paths], size))
+        return lens, "It was found."
+
+    found = photographs(tmp_path, {}, find_lens=finds)
+    assert asked == [(["1.png", "2.png", "3.png"], (400, 300))]
+    assert [view.camera for view in found.views] == [lens] * 3 and found.calibrated == {"": lens}
+    assert found.remarks[0] == "It was found." and "1 of 4 images were left out" in found.remarks[1]
+    write_lenses(tmp_path, found.calibrated)
+    assert load_camera(tmp_path / LENS) == lens
+    asked.clear()
+    assert photographs(tmp_path, {}, find_lens=finds).views == found.views or not asked
+    (tmp_path / LENS).unlink()
+
+    def refuses(paths: list[Path], size: tuple[int, int]) -> tuple[KannalaBrandt, str]:
+        raise InputError("they are too few")
+
+    told = (
+        r"3 of 400 x 300 pixels, 1 of 300 x 300 pixels, .* have no calibration, and they are too few; else .*--camera"
+    )
+    with pytest.raises(InputError, match=told):
+        photographs(tmp_path, {}, find_lens=refuses)
+
+
+def test_what_is_said_where_photographs_do_not_tell_their_lens(tmp_path, rng):
+    paths = []
+    for number in range(7):
+        paths.append(tmp_path / f"{number}.png")
+        cv2.imwrite(str(paths[-1]), rng.integers(0, 255, (200, 300), dtype=np.uint8))
+    with pytest.raises(InputError, match="too few to calibrate their lens by them, which takes 6 or more"):
+        find_lens(paths[:5], (300, 200), lambda *_: None)
+    with pytest.raises(InputError, match="only 0 pairs of them match"):
+        find_lens(paths, (300, 200), lambda *_: None)
+
+
+SCENE = """
+kind = "rendered"
+name = "flat"
+provenance = "spherloc"
+world = "apartment"
+[camera]
+model = "kannala_brandt"
+width = 420
+height = 420
+fx = 150.0
+fy = 150.0
+cx = 206.0
+cy = 213.0
+distortion = [-0.0416667, 0.00052083, 0.0, 0.0]
+[references]
+count = 14
+[queries]
+count = 1
+start = 0.5
+stop = 0.6
+"""
+
+
+def test_a_lens_is_found_by_images(tmp_path):
+    """Rendered fisheyes of a flat; the principal point may be off as if the camera were turned."""
+    path = tmp_path / "flat.toml"
+    path.write_text(SCENE)
+    images = []
+    for view in load_scene(path).references:
+        images.append(tmp_path / f"{view.name}.png")
+        cv2.imwrite(str(images[-1]), view.read())
+        true = view.camera
+    stages = []
+    camera, remark = find_lens(images, (420, 420), lambda kind, done, count: stages.append((kind, done, count)))
+    radii = np.linspace(0.0, 200.0, 10)
+    assert np.degrees(np.abs(angles(camera, radii) - angles(true, radii)).max()) < 1.5
+    assert abs(camera.cx - true.cx) < 4 and abs(camera.cy - true.cy) < 4
+    assert re.fullmatch(
+        r"There was no calibration, so the lens was calibrated by [0-9,]+ matches between the photographs, "
+        r"over a field of view of \d+°\. Two halves of them tell lenses that differ from it by \d\.\d° at most\.",
+        remark,
+    )
+    assert [kind for kind, done, count in stages if done == count] == [
+        "images searched for features of their lens",
+        "pairs matched for the lens",
+        "lenses fitted to the matches",
+    ]
+    again, _ = find_lens(images, (420, 420), lambda *_: None)
+    assert again == camera, "what is done is used again only if the lens is the same to the last bit"
