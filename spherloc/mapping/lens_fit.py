@@ -64,7 +64,7 @@ _STEP = 1e-6
 
 
 @dataclass(frozen=True)
-class Lens:
+class RadialLens:
     """A radial lens."""
 
     f: float
@@ -108,7 +108,7 @@ class Expected:
     """Angle at the rim; None if that may be any."""
     k1: float = 0.0
 
-    def off(self, lens: Lens) -> FloatArray:
+    def off(self, lens: RadialLens) -> FloatArray:
         """How far a lens (5 or 6 numbers) is from it, in pixels."""
         sd_px = SD_CENTRE * self.rim.radius
         off = [
@@ -128,7 +128,7 @@ class Expected:
 class LensFit:
     """A lens that was fitted, and how well."""
 
-    lens: Lens
+    lens: RadialLens
     matches: int
     """Number of the matches that fit."""
     radii_px: FloatArray
@@ -162,15 +162,15 @@ def _even(pixels: FloatArray, most: int) -> FloatArray:
     return pixels[np.unique(np.linspace(0, len(pixels) - 1, most).astype(int))] if len(pixels) > most else pixels
 
 
-def _starts(pycolmap: Any, pairs: Sequence[Any], rim: Circle) -> list[Lens]:
+def _starts(pycolmap: Any, pairs: Sequence[Any], rim: Circle) -> list[RadialLens]:
     """The best lens of each kind, by the number of matches that fit."""
     lenses = []
     for half, (k1, k2) in product(HALF_FIELDS_RAD, KINDS):
         reach = half * (1.0 + k1 * half**2 + k2 * half**4)
-        lenses.append(Lens(rim.radius / reach, rim.x, rim.y, k1, k2))
+        lenses.append(RadialLens(rim.radius / reach, rim.x, rim.y, k1, k2))
     few = [tuple(_even(pixels, TRIED_MATCHES) for pixels in pair) for pair in pairs[:TRIED_PAIRS]]
 
-    def fitting(lens: Lens) -> int:
+    def fitting(lens: RadialLens) -> int:
         return sum(len(geometry.inlier_matches) for pair in few if (geometry := _two(pycolmap, pair, lens, TRIED_PX)))
 
     counts = dict(as_completed(fitting, lenses))
@@ -178,7 +178,7 @@ def _starts(pycolmap: Any, pairs: Sequence[Any], rim: Circle) -> list[Lens]:
     return sorted(best, key=lambda lens: -counts[lens])
 
 
-def _two(pycolmap: Any, pair: Any, lens: Lens, bound_px: float) -> Any:
+def _two(pycolmap: Any, pair: Any, lens: RadialLens, bound_px: float) -> Any:
     """The ``TwoViewGeometry`` of matched pixels under a lens; None if hardly any fits."""
     height = max(64, round(pi * lens.f))
     sphere = Equirectangular(2 * height, height)
@@ -198,7 +198,7 @@ def _two(pycolmap: Any, pair: Any, lens: Lens, bound_px: float) -> Any:
 
 
 def _refined(
-    pycolmap: Any, pairs: Sequence[Any], lens: Lens, expected: Expected, bounds_px: Sequence[float]
+    pycolmap: Any, pairs: Sequence[Any], lens: RadialLens, expected: Expected, bounds_px: Sequence[float]
 ) -> LensFit:
     """A lens, refined with the poses of the pairs whose matches fit it."""
     for bound_px in bounds_px:
@@ -230,15 +230,15 @@ def _motions(geometries: Sequence[Any]) -> FloatArray:
 
 
 def _adjusted(
-    lens: Lens, motions: FloatArray, seen: PixelPairs, of: IntArray, expected: Expected
-) -> tuple[Lens, FloatArray]:
+    lens: RadialLens, motions: FloatArray, seen: PixelPairs, of: IntArray, expected: Expected
+) -> tuple[RadialLens, FloatArray]:
     """The lens and the distances (M,), px, of matched pixels (M, 2) from their epipolar curves, after both the lens and
     the motions (P, 6) were fitted; ``of`` is the motion of each match."""
     first = np.array([lens.f, lens.cx, lens.cy, lens.k1, lens.k2])
     count, size = len(of), len(first)
 
     def off(values: FloatArray) -> FloatArray:
-        now = Lens(*values[:size])
+        now = RadialLens(*values[:size])
         return np.concatenate([_distances_px(now, values[size:].reshape(-1, 6), seen, of), expected.off(now)])
 
     def slopes(values: FloatArray) -> FloatArray:
@@ -270,10 +270,10 @@ def _adjusted(
         f_scale=0.5,
         max_nfev=MAX_STEPS,
     )
-    return Lens(*(float(value) for value in found.x[:size])), found.fun[:count]
+    return RadialLens(*(float(value) for value in found.x[:size])), found.fun[:count]
 
 
-def _distances_px(lens: Lens, motions: FloatArray, seen: PixelPairs, of: IntArray) -> FloatArray:
+def _distances_px(lens: RadialLens, motions: FloatArray, seen: PixelPairs, of: IntArray) -> FloatArray:
     """Sampson distances (M,), px, of matched pixels under motions (P, 6)."""
     turn = Rotation.from_rotvec(motions[:, :3]).as_matrix()[of]
     move = (motions[:, 3:] / np.linalg.norm(motions[:, 3:], axis=1, keepdims=True))[of]

@@ -14,7 +14,7 @@ from spherloc.datasets import load_scene
 from spherloc.errors import InputError
 from spherloc.geometry import so3_exp
 from spherloc.mapping.image_circle import image_circle
-from spherloc.mapping.lens_fit import Circle, Lens, fit_lens
+from spherloc.mapping.lens_fit import Circle, RadialLens, fit_lens
 from spherloc.mapping.photographs import photographs
 from spherloc.mapping.scene_files import LENS, write_lenses
 from spherloc.mapping.unknown_lens import MAX_OFF_RAD, find_lens
@@ -41,9 +41,9 @@ def matched(rng: np.random.Generator, *, turned: bool) -> list[tuple[np.ndarray,
     return pairs
 
 
-def angles(lens: Lens | KannalaBrandt, radii: np.ndarray) -> np.ndarray:
+def angles(lens: RadialLens | KannalaBrandt, radii: np.ndarray) -> np.ndarray:
     pixels = np.column_stack([lens.cx + radii, np.full(len(radii), lens.cy)])
-    rays = lens.bearings(pixels)[0] if isinstance(lens, Lens) else lens.unproject(pixels)[0]
+    rays = lens.bearings(pixels)[0] if isinstance(lens, RadialLens) else lens.unproject(pixels)[0]
     return np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
 
 
@@ -64,7 +64,7 @@ def test_a_camera_that_only_went_straight_ahead_does_not_tell_its_lens(rng):
 
 
 def test_bearings_of_a_lens_and_their_slopes(rng):
-    lens = Lens(270.0, 458.0, 343.0, -1 / 24, 1 / 1920)
+    lens = RadialLens(270.0, 458.0, 343.0, -1 / 24, 1 / 1920)
     pixels = rng.uniform((0, 0), (900, 700), (200, 2))
     rays, outwards, sideways = lens.bearings(pixels)
     np.testing.assert_allclose(rays, TRUE.unproject(pixels)[0], atol=1e-9)
