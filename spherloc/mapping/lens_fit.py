@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.mapping.image_circle import Circle
 from spherloc.mapping.parallel import as_completed
+from spherloc.mapping.upright import Tell
 from spherloc.types import FloatArray, IntArray
 
 PixelPairs = tuple[FloatArray, FloatArray]
@@ -29,6 +30,8 @@ HALF_FIELDS_RAD = np.radians([50.0, 60.0, 70.0, 80.0, 90.0, 100.0, 110.0])
 """Angles at the rim that are tried."""
 KINDS = ((1 / 12, 1 / 120), (0.0, 0.0), (-1 / 24, 1 / 1920))
 """k1 and k2 that are tried: of the stereographic, equidistant and equisolid projections."""
+STAGE, FITS = "fits of the lens to the matches", len(KINDS) + 3
+"""What progress is called, and the number of fits: one of each kind, then by all pairs and by two halves of them."""
 SD_K = np.array([0.06, 0.015])
 """How much k1 and k2 of real lenses vary."""
 SHIFT_K1 = 0.04
@@ -136,7 +139,9 @@ class LensFit:
     score: float
 
 
-def fit_lens(pycolmap: Any, pairs: Sequence[PixelPairs], rim: Circle, *, is_circle: bool) -> tuple[LensFit, float]:
+def fit_lens(
+    pycolmap: Any, pairs: Sequence[PixelPairs], rim: Circle, tell: Tell, *, is_circle: bool
+) -> tuple[LensFit, float]:
     """The lens that fits pairs of images, those with most matches first, and the largest angle, rad, by which the
     lenses of two halves of the pairs differ from it.
 
@@ -146,15 +151,20 @@ def fit_lens(pycolmap: Any, pairs: Sequence[PixelPairs], rim: Circle, *, is_circ
     every = [tuple(_even(pixels, MAX_MATCHES) for pixels in pair) for pair in pairs]
     expected = Expected(rim, float(CIRCLE_HALF_RAD) if is_circle else None)
     few = every[:FIRST_PAIRS]
-    starts = [_refined(pycolmap, few, lens, expected, FIRST_BOUNDS_PX) for lens in _starts(pycolmap, every, rim)]
+    starts: list[LensFit] = []
+    for lens in _starts(pycolmap, every, rim):
+        starts.append(_refined(pycolmap, few, lens, expected, FIRST_BOUNDS_PX))
+        tell(STAGE, len(starts), FITS)
     best = max(starts, key=lambda fit: fit.score)
     whole = _refined(pycolmap, every, best.lens, expected, BOUNDS_PX)
+    tell(STAGE, FITS - 2, FITS)
     radii = np.quantile(whole.radii_px, QUANTILES)
     angles = whole.lens.angles(radii)
     off = 0.0
     for half, shift in ((every[0::2], SHIFT_K1), (every[1::2], -SHIFT_K1)):
         other = _refined(pycolmap, half, whole.lens, replace(expected, k1=shift), BOUNDS_PX)
         off = max(off, float(np.abs(other.lens.angles(radii) - angles).max()))
+    tell(STAGE, FITS, FITS)
     return whole, off
 
 

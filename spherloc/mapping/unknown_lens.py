@@ -55,9 +55,7 @@ def find_lens(paths: Sequence[Path], size: tuple[int, int], tell: Tell) -> tuple
     if len(pairs) < MIN_PAIRS:
         raise InputError(f"only {len(pairs)} pairs of them match, too few to calibrate their lens by them: take more")
     try:
-        tell("lenses fitted to the matches", 0, 1)
-        fit, off_rad = fit_lens(pycolmap, pairs, rim, is_circle=circle is not None)
-        tell("lenses fitted to the matches", 1, 1)
+        fit, off_rad = fit_lens(pycolmap, pairs, rim, tell, is_circle=circle is not None)
         lens = fit.lens
         camera = KannalaBrandt(*size, lens.f, lens.f, lens.cx, lens.cy, (lens.k1, lens.k2, 0.0, 0.0))
     except (ValueError, CalibrationError):

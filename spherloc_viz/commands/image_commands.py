@@ -252,7 +252,7 @@ def map(
     features: Annotated[str | None, arg(metavar="sift|aliked|sift+aliked")] = None,
     localize: OptionalPath = None,
 ) -> int:
-    """Make a map of your own photographs: panoramas, or images of calibrated wide cameras.
+    """Make a map of your own photographs: panoramas, or images of fisheyes and other wide cameras.
 
     Features, matches, COLMAP's structure from motion, which way is down, and scale if you give one; then a scene file
     that opens at once. Needs the extra colmap. Stop it when you like: the same command goes on. Ends with 0 if all
@@ -268,7 +268,8 @@ def map(
 
     Args:
         folder: Folder of the photographs, or of a folder for each camera; with --video, where its frames are put.
-        camera: Calibration file; without it, those beside the images are taken, and others of 2 to 1 are panoramas.
+        camera: Calibration file; without it, those beside the images are taken, others of 2 to 1 are panoramas, and
+            matches between the rest tell their lens.
         camera_name: Which camera of that file all images have; otherwise their name or their folder's says it.
         panorama: Images of 2 to 1 are panoramas, whatever lies beside them.
         video: Take frames from this video first, the sharpest of each stretch.

@@ -49,7 +49,7 @@ def angles(lens: RadialLens | KannalaBrandt, radii: np.ndarray) -> np.ndarray:
 
 def test_a_lens_is_found_by_matches(rng):
     pycolmap = registry.require("pycolmap", "colmap", "a test")
-    fit, off_rad = fit_lens(pycolmap, matched(rng, turned=True), RIM, is_circle=False)
+    fit, off_rad = fit_lens(pycolmap, matched(rng, turned=True), RIM, lambda *_: None, is_circle=False)
     radii = np.linspace(0.0, 450.0, 10)
     assert np.degrees(np.abs(angles(fit.lens, radii) - angles(TRUE, radii)).max()) < 0.3
     assert np.hypot(fit.lens.cx - TRUE.cx, fit.lens.cy - TRUE.cy) < 2.0
@@ -59,7 +59,7 @@ def test_a_lens_is_found_by_matches(rng):
 
 def test_a_camera_that_only_went_straight_ahead_does_not_tell_its_lens(rng):
     pycolmap = registry.require("pycolmap", "colmap", "a test")
-    _, off_rad = fit_lens(pycolmap, matched(rng, turned=False), RIM, is_circle=False)
+    _, off_rad = fit_lens(pycolmap, matched(rng, turned=False), RIM, lambda *_: None, is_circle=False)
     assert off_rad > MAX_OFF_RAD
 
 
@@ -189,7 +189,7 @@ def test_a_lens_is_found_by_images(tmp_path):
     assert [kind for kind, done, count in stages if done == count] == [
         "images searched for features of their lens",
         "pairs matched for the lens",
-        "lenses fitted to the matches",
+        "fits of the lens to the matches",
     ]
     again, _ = find_lens(images, (420, 420), lambda *_: None)
     assert again == camera, "what is done is used again only if the lens is the same to the last bit"

@@ -25,9 +25,9 @@ from spherloc_viz.app.web.viser_internals import limit_uploads, update_widget
 from spherloc_viz.app.workers import BackgroundWorker
 
 MAP_ABOUT = (
-    "Panoramas twice as wide as high, or images with the calibrations of their cameras beside them. It takes some "
-    "minutes, and opens when it is done. For metres, give as Scale the height of the cameras above the ground (1.6), "
-    "or two photographs and their distance (1.jpg 5.jpg 12.5)."
+    "Panoramas twice as wide as high, or fisheyes, with a calibration beside them or without. It takes some minutes, "
+    "and opens when it is done. For metres, give as Scale the height of the cameras above the ground (1.6), or two "
+    "photographs and their distance (1.jpg 5.jpg 12.5)."
 )
 MAX_NAMED = 3
 """Largest number of folders, besides the last, that are named."""
