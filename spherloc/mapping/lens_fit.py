@@ -2,9 +2,10 @@
 
 The lens is radial, r = f theta (1 + k1 theta^2 + k2 theta^4) (Eq. 4). Lenses of all usual kinds and fields of view are
 tried. The best of each kind are refined together with the relative poses of the pairs, by the distance of each match
-from its epipolar curves in pixels (the Sampson distance). If the camera only went straight ahead, any radial lens fits:
-so the two halves of the pairs are fitted by themselves as well, from opposite expectations, and what they differ by
-says how well the lens is known.
+from its epipolar curves in pixels (the Sampson distance), or from its place if the camera only turned: there a wrong
+lens would make up a motion. If the camera only went straight ahead, any radial lens fits:
+so the two halves of the pairs are fitted by themselves as well, from opposite expectations, and what they and other
+lenses that fit nearly as well differ by says how well the lens is known.
 """
 
 from collections.abc import Sequence
@@ -20,14 +21,16 @@ from scipy.spatial.transform import Rotation
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.mapping.image_circle import Circle
 from spherloc.mapping.parallel import as_completed
+from spherloc.mapping.telling import far_rotation, unmoved
 from spherloc.mapping.upright import Tell
-from spherloc.types import FloatArray, IntArray
+from spherloc.types import BoolArray, FloatArray, IntArray
 
 PixelPairs = tuple[FloatArray, FloatArray]
 """Matched pixels (M, 2) of two images."""
 
 HALF_FIELDS_RAD = np.radians([50.0, 60.0, 70.0, 80.0, 90.0, 100.0, 110.0])
-"""Angles at the rim that are tried."""
+CIRCLE_FIELDS_RAD = HALF_FIELDS_RAD[2:]
+"""Angles at the rim that are tried, without an image circle and with one."""
 KINDS = ((1 / 12, 1 / 120), (0.0, 0.0), (-1 / 24, 1 / 1920))
 """k1 and k2 that are tried: of the stereographic, equidistant and equisolid projections."""
 STAGE, FITS = "fits of the lens to the matches", len(KINDS) + 3
@@ -53,6 +56,8 @@ FIRST_BOUNDS_PX, BOUNDS_PX = (3.0, 1.5), (2.0, 1.5, 1.0)
 """Bounds on a match, one refinement after another: of the lenses that are tried, and of the best."""
 MAX_STEPS = 15
 """Largest number of steps of a refinement; the next one goes on."""
+NEARLY = 0.85
+"""Another lens fits nearly as well if its score is this share of that of the best."""
 LAST_PX = 0.7
 """The lens is taken of which most matches are within this bound, and closest."""
 MIN_MATCHES = 20
@@ -142,8 +147,8 @@ class LensFit:
 def fit_lens(
     pycolmap: Any, pairs: Sequence[PixelPairs], rim: Circle, tell: Tell, *, is_circle: bool
 ) -> tuple[LensFit, float]:
-    """The lens that fits pairs of images, those with most matches first, and the largest angle, rad, by which the
-    lenses of two halves of the pairs differ from it.
+    """The lens that fits pairs of images, those with most matches first, and the largest angle, rad, by which lenses
+    differ from it that fit nearly as well, or that two halves of the pairs have.
 
     ``rim`` is the image circle, or one through the corners if the image has none. Raises ``ValueError`` if hardly any
     match fits.
@@ -151,45 +156,88 @@ def fit_lens(
     every = [tuple(_even(pixels, MAX_MATCHES) for pixels in pair) for pair in pairs]
     expected = Expected(rim, float(CIRCLE_HALF_RAD) if is_circle else None)
     few = every[:FIRST_PAIRS]
-    starts: list[LensFit] = []
-    for lens in _starts(pycolmap, every, rim):
-        starts.append(_refined(pycolmap, few, lens, expected, FIRST_BOUNDS_PX))
-        tell(STAGE, len(starts), FITS)
-    best = max(starts, key=lambda fit: fit.score)
+    tried: list[LensFit] = []
+    for lens in _starts(pycolmap, every, rim, CIRCLE_FIELDS_RAD if is_circle else HALF_FIELDS_RAD):
+        tried.append(_refined(pycolmap, few, lens, expected, FIRST_BOUNDS_PX))
+        tell(STAGE, len(tried), FITS)
+    best, *others = sorted(tried, key=lambda fit: -fit.score)
     whole = _refined(pycolmap, every, best.lens, expected, BOUNDS_PX)
     tell(STAGE, FITS - 2, FITS)
     radii = np.quantile(whole.radii_px, QUANTILES)
-    angles = whole.lens.angles(radii)
-    off = 0.0
+
+    def off_rad(other: LensFit) -> float:
+        return float(np.abs(other.lens.angles(radii) - whole.lens.angles(radii)).max())
+
+    alike = []
+    for other in others:
+        if other.score > NEARLY * best.score and off_rad(other) > 0.0:
+            other = _refined(pycolmap, few, other.lens, expected, BOUNDS_PX)
+            same = _refined(pycolmap, few, whole.lens, expected, BOUNDS_PX[-1:])
+            alike += [other] if other.score > NEARLY * same.score else []
     for half, shift in ((every[0::2], SHIFT_K1), (every[1::2], -SHIFT_K1)):
-        other = _refined(pycolmap, half, whole.lens, replace(expected, k1=shift), BOUNDS_PX)
-        off = max(off, float(np.abs(other.lens.angles(radii) - angles).max()))
+        alike.append(_refined(pycolmap, half, whole.lens, replace(expected, k1=shift), BOUNDS_PX))
     tell(STAGE, FITS, FITS)
-    return whole, off
+    return whole, max(map(off_rad, alike))
 
 
 def _even(pixels: FloatArray, most: int) -> FloatArray:
     return pixels[np.unique(np.linspace(0, len(pixels) - 1, most).astype(int))] if len(pixels) > most else pixels
 
 
-def _starts(pycolmap: Any, pairs: Sequence[Any], rim: Circle) -> list[RadialLens]:
+def _starts(pycolmap: Any, pairs: Sequence[Any], rim: Circle, half_fields_rad: FloatArray) -> list[RadialLens]:
     """The best lens of each kind, by the number of matches that fit."""
     lenses = []
-    for half, (k1, k2) in product(HALF_FIELDS_RAD, KINDS):
+    for half, (k1, k2) in product(half_fields_rad, KINDS):
         reach = half * (1.0 + k1 * half**2 + k2 * half**4)
         lenses.append(RadialLens(rim.radius / reach, rim.x, rim.y, k1, k2))
     few = [tuple(_even(pixels, TRIED_MATCHES) for pixels in pair) for pair in pairs[:TRIED_PAIRS]]
 
-    def fitting(lens: RadialLens) -> int:
-        return sum(len(geometry.inlier_matches) for pair in few if (geometry := _two(pycolmap, pair, lens, TRIED_PX)))
+    def worth(lens: RadialLens) -> int:
+        return sum(motion.worth for pair in few if (motion := _motion(pycolmap, pair, lens, TRIED_PX)))
 
-    counts = dict(as_completed(fitting, lenses))
+    counts = dict(as_completed(worth, lenses))
     best = [max((lens for lens in lenses if lens.k1 == k1), key=counts.__getitem__) for k1, _ in KINDS]
     return sorted(best, key=lambda lens: -counts[lens])
 
 
-def _two(pycolmap: Any, pair: Any, lens: RadialLens, bound_px: float) -> Any:
-    """The ``TwoViewGeometry`` of matched pixels under a lens; None if hardly any fits."""
+@dataclass(frozen=True, eq=False)
+class PairMotion:
+    """How the camera moved between two images."""
+
+    fits: IntArray
+    """(K,) matches that fit."""
+    turn: FloatArray
+    """Rotation (3, 3) of the second camera from the first."""
+    move: FloatArray
+    """Direction (3,) of the first camera's centre, seen from the second; any if the camera only turned."""
+    only_turned: bool
+
+    @property
+    def worth(self) -> int:
+        """Number of distances that fit: a match fixes two where the camera only turned, else one."""
+        return (2 if self.only_turned else 1) * len(self.fits)
+
+
+def _motion(pycolmap: Any, pair: Any, lens: RadialLens, bound_px: float) -> PairMotion | None:
+    """The motion that matched pixels fit under a lens, a rotation alone if that says more; None if hardly any fits."""
+    first, second = (lens.bearings(pixels)[0] for pixels in pair)
+    turn = far_rotation(first, second, bound_px / lens.f)
+    found: list[PairMotion] = []
+    if turn is not None:
+        fits = np.flatnonzero(unmoved(first, second, turn, bound_px / lens.f))
+        found.append(PairMotion(fits, turn, np.array([1.0, 0.0, 0.0]), only_turned=True))
+    geometry = _two_view_geometry(pycolmap, (first, second), lens, bound_px)
+    if len(geometry.inlier_matches) >= MIN_MATCHES and geometry.cam2_from_cam1 is not None:
+        pose = np.asarray(geometry.cam2_from_cam1.matrix())
+        fits = geometry.inlier_matches[:, 0].astype(np.int64)
+        move = pose[:, 3] if pose[:, 3].any() else np.array([1.0, 0.0, 0.0])
+        found.append(PairMotion(fits, pose[:, :3], move, only_turned=False))
+    best = max(found, key=lambda motion: motion.worth, default=None)
+    return best if best is not None and len(best.fits) >= MIN_MATCHES else None
+
+
+def _two_view_geometry(pycolmap: Any, rays: tuple[FloatArray, FloatArray], lens: RadialLens, bound_px: float) -> Any:
+    """The ``TwoViewGeometry`` of matched bearings, on a panorama of the lens' pixels per radian."""
     height = max(64, round(pi * lens.f))
     sphere = Equirectangular(2 * height, height)
     options = pycolmap.TwoViewGeometryOptions()
@@ -199,57 +247,61 @@ def _two(pycolmap: Any, pair: Any, lens: RadialLens, bound_px: float) -> Any:
     options.compute_relative_pose = True
     size = [sphere.width, sphere.height]
     camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=size[0], height=size[1], params=size)
-    seen = [sphere.project(lens.bearings(pixels)[0])[0] for pixels in pair]
-    each = np.arange(len(seen[0]), dtype=np.uint32)
-    found = pycolmap.estimate_calibrated_two_view_geometry(
-        camera, seen[0], camera, seen[1], np.column_stack([each, each]), options
-    )
-    return found if len(found.inlier_matches) >= MIN_MATCHES else None
+    first, second = (sphere.project(one)[0] for one in rays)
+    each = np.arange(len(first), dtype=np.uint32)
+    pairs = np.column_stack([each, each])
+    return pycolmap.estimate_calibrated_two_view_geometry(camera, first, camera, second, pairs, options)
+
+
+@dataclass(frozen=True, eq=False)
+class LensMatches:
+    """Matches that fit motions, M of them."""
+
+    seen: PixelPairs
+    """(M, 2) pixels in the first and in the second image of their pair."""
+    of: IntArray
+    """(M,) index of their motion."""
+    only_turned: BoolArray
+    """(M,) whether that is a rotation alone."""
 
 
 def _refined(
     pycolmap: Any, pairs: Sequence[Any], lens: RadialLens, expected: Expected, bounds_px: Sequence[float]
 ) -> LensFit:
-    """A lens, refined with the poses of the pairs whose matches fit it."""
+    """A lens, refined with the motions that the matches of the pairs fit."""
     for bound_px in bounds_px:
         found = dict(
             as_completed(
-                lambda pair, bound=bound_px, now=lens: _two(pycolmap, pairs[pair], now, bound), range(len(pairs))
+                lambda pair, bound=bound_px, now=lens: _motion(pycolmap, pairs[pair], now, bound), range(len(pairs))
             )
         )
-        kept = [pair for pair in range(len(pairs)) if found[pair] is not None]
+        kept = [(pairs[pair], motion) for pair in range(len(pairs)) if (motion := found[pair]) is not None]
         if not kept:
             raise ValueError("hardly any match fits a motion of the camera")
-        chosen = [found[pair].inlier_matches[:, 0] for pair in kept]
-        seen = [
-            np.concatenate([pairs[pair][side][some] for pair, some in zip(kept, chosen, strict=True)])
-            for side in (0, 1)
-        ]
-        of = np.repeat(np.arange(len(kept)), [len(some) for some in chosen])
-        lens, off = _adjusted(lens, _motions([found[pair] for pair in kept]), (seen[0], seen[1]), of, expected)
-    radii = np.linalg.norm(np.concatenate(seen) - (lens.cx, lens.cy), axis=1)
-    score = float(np.maximum(1.0 - (off / LAST_PX) ** 2, 0.0).sum())
-    return LensFit(lens, len(of), radii, score)
-
-
-def _motions(geometries: Sequence[Any]) -> FloatArray:
-    """Rotation vectors and directions (P, 6) of relative poses; of pairs from one place, any direction."""
-    poses = np.array([np.asarray(geometry.cam2_from_cam1.matrix()) for geometry in geometries])
-    poses[~poses[:, :, 3].any(axis=1), 0, 3] = 1.0
-    return np.hstack([Rotation.from_matrix(poses[:, :, :3]).as_rotvec(), poses[:, :, 3]])
+        first, second = (np.concatenate([pair[side][motion.fits] for pair, motion in kept]) for side in (0, 1))
+        counts = [len(motion.fits) for _, motion in kept]
+        only_turned = np.repeat([motion.only_turned for _, motion in kept], counts)
+        matches = LensMatches((first, second), np.repeat(np.arange(len(kept)), counts), only_turned)
+        turns = Rotation.from_matrix([motion.turn for _, motion in kept]).as_rotvec()
+        lens, off_px = _adjusted(lens, np.hstack([turns, [motion.move for _, motion in kept]]), matches, expected)
+    radii = np.linalg.norm(np.concatenate([first, second]) - (lens.cx, lens.cy), axis=1)
+    score = float(np.maximum(1.0 - (off_px / LAST_PX) ** 2, 0.0).sum())
+    return LensFit(lens, len(first), radii, score)
 
 
 def _adjusted(
-    lens: RadialLens, motions: FloatArray, seen: PixelPairs, of: IntArray, expected: Expected
+    lens: RadialLens, motions: FloatArray, matches: LensMatches, expected: Expected
 ) -> tuple[RadialLens, FloatArray]:
-    """The lens and the distances (M,), px, of matched pixels (M, 2) from their epipolar curves, after both the lens and
-    the motions (P, 6) were fitted; ``of`` is the motion of each match."""
+    """The lens and the distances of the matches, px, as of ``_distances_px``, after both the lens and the motions
+    (P, 6), a rotation vector and a direction each, were fitted."""
     first = np.array([lens.f, lens.cx, lens.cy, lens.k1, lens.k2])
-    count, size = len(of), len(first)
+    size = len(first)
+    of = np.concatenate([matches.of, matches.of[matches.only_turned]])
+    count = len(of)
 
     def off(values: FloatArray) -> FloatArray:
         now = RadialLens(*values[:size])
-        return np.concatenate([_distances_px(now, values[size:].reshape(-1, 6), seen, of), expected.off(now)])
+        return np.concatenate([_distances_px(now, values[size:].reshape(-1, 6), matches), expected.off(now)])
 
     def slopes(values: FloatArray) -> FloatArray:
         here = off(values)
@@ -283,14 +335,23 @@ def _adjusted(
     return RadialLens(*(float(value) for value in found.x[:size])), found.fun[:count]
 
 
-def _distances_px(lens: RadialLens, motions: FloatArray, seen: PixelPairs, of: IntArray) -> FloatArray:
-    """Sampson distances (M,), px, of matched pixels under motions (P, 6)."""
-    turn = Rotation.from_rotvec(motions[:, :3]).as_matrix()[of]
-    move = (motions[:, 3:] / np.linalg.norm(motions[:, 3:], axis=1, keepdims=True))[of]
-    (rays, *ways), (others, *other_ways) = (lens.bearings(pixels) for pixels in seen)
-    plane_of_other = np.cross(move, np.einsum("nij,nj->ni", turn, rays))
+def _distances_px(lens: RadialLens, motions: FloatArray, matches: LensMatches) -> FloatArray:
+    """Distances (M + T,) of matched pixels under motions (P, 6): the Sampson distance to the epipolar curves, or, for
+    the T whose camera only turned, the offset away from the principal point and, at the end, that across."""
+    turn = Rotation.from_rotvec(motions[:, :3]).as_matrix()[matches.of]
+    move = (motions[:, 3:] / np.linalg.norm(motions[:, 3:], axis=1, keepdims=True))[matches.of]
+    (rays, *ways), (others, *other_ways) = (lens.bearings(pixels) for pixels in matches.seen)
+    turned = np.einsum("nij,nj->ni", turn, rays)
+    plane_of_other = np.cross(move, turned)
     plane_of_first = np.einsum("nji,nj->ni", turn, np.cross(others, move))
     slopes = [np.sum(plane_of_first * way, axis=1) for way in ways]
     slopes += [np.sum(plane_of_other * way, axis=1) for way in other_ways]
     steep = np.sqrt(sum(slope**2 for slope in slopes))
-    return np.sum(others * plane_of_other, axis=1) / np.maximum(steep, 1e-9)
+    epipolar = np.sum(others * plane_of_other, axis=1) / np.maximum(steep, 1e-9)
+    # Both pixels have noise, so that an offset is larger than a Sampson distance by the square root of two.
+    away, across = (
+        np.sum((turned - others) * way, axis=1) / np.maximum(np.sum(way * way, axis=1), 1e-18) / np.sqrt(2.0)
+        for way in other_ways
+    )
+    only_turned = matches.only_turned
+    return np.concatenate([np.where(only_turned, away, epipolar), across[only_turned]])

@@ -39,9 +39,11 @@ BLACK = 16
 SHARPNESS_PX = 512
 """Frames are scaled to this longer side before their sharpness is compared."""
 
-LensFinder = Callable[[Sequence[Path], tuple[int, int]], tuple[Camera, str]]
-"""Calibrates a lens by images that it took, all of a size (width, height), and says how in a sentence; raises
-``InputError`` with a part of a sentence if they do not tell it."""
+CalibratedLens = tuple[Camera, str]
+"""A lens that was calibrated by the images that it took, and how, in sentences."""
+LensFinder = Callable[[Sequence[Path], tuple[int, int]], CalibratedLens]
+"""Calibrates a lens by images, all of a size (width, height); raises ``InputError`` with a part of a sentence if they
+do not tell it."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Photographs:
     remarks: tuple[str, ...]
     cameras: Mapping[str, Camera]
     """The calibrations that were given or found, by name or by the folder of their images."""
-    calibrated: Mapping[str, Camera] = field(default_factory=dict)
+    calibrated: Mapping[str, CalibratedLens] = field(default_factory=dict)
     """Those that the images themselves told, by their folder in that of the map; empty for that itself."""
 
 
@@ -115,7 +117,7 @@ def with_cameras(
     views: list[View] = []
     remarks: list[str] = []
     known = dict(cameras)
-    calibrated: dict[str, Camera] = {}
+    calibrated: dict[str, CalibratedLens] = {}
     if any(is_image(name) for name in there) or not inside:
         known = known or _beside(folder, "")
         views, remarks, lens = _of_folder(folder, "", cameras, known, panorama, find_lens)
@@ -201,7 +203,7 @@ def _of_folder(
     beside: Mapping[str, Camera],
     panorama: bool,
     find_lens: LensFinder | None,
-) -> tuple[list[View], list[str], Camera | None]:
+) -> tuple[list[View], list[str], CalibratedLens | None]:
     """The images of the folder ``inside`` of ``root``, or of ``root`` itself if that is empty, remarks on others, and
     the camera that ``find_lens`` found, if it was needed.
 
@@ -236,22 +238,22 @@ def _of_folder(
     if used and not given:
         remarks.append(f"The calibration found beside them: {', '.join(map(shorten, used))}.")
     rest = sorted(name for names in sizes.values() for name in names if name not in camera_of)
-    lens = None
+    lens: CalibratedLens | None = None
     if rest and not camera_of and not given:
         order = sorted(sizes, key=lambda size: -len(sizes[size]))
         told = ", ".join(f"{len(sizes[size])} of {size[0]} x {size[1]} pixels" for size in order[:MAX_NAMED])
         files = "their calibration" if len(sizes) == 1 else "a file with the calibrations of all of them"
-        known = advice("calibration").format(files=files)
+        put_it = advice("calibration").format(files=files)
         unknown = f"{folder}: its photographs, {told}, are not full panoramas (2 to 1)"
         if find_lens is None:
-            raise InputError(f"{unknown}; {known}.")
+            raise InputError(f"{unknown}; {put_it}.")
         try:
-            lens, how = find_lens([folder / name for name in sizes[order[0]]], order[0])
+            lens = find_lens([folder / name for name in sizes[order[0]]], order[0])
         except InputError as error:
-            raise InputError(f"{unknown} and have no calibration, and {error}; else {known}.") from None
-        camera_of = dict.fromkeys(sizes[order[0]], lens)
+            raise InputError(f"{unknown} and have no calibration, and {error}. Or {put_it}.") from None
+        camera_of = dict.fromkeys(sizes[order[0]], lens[0])
         rest = [name for name in rest if name not in camera_of]
-        remarks.append(how)
+        remarks.append(lens[1])
     if rest:
         width, height = next(size for size, names in sizes.items() if rest[0] in names)
         remarks.append(

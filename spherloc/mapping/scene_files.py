@@ -5,11 +5,12 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 from spherloc.cameras.base import Camera
 from spherloc.frontend.view import View
-from spherloc.mapping.photographs import NewImages, cameras_of
+from spherloc.mapping.photographs import CalibratedLens, NewImages, cameras_of
 
 MODEL = "model"
 """Folder of COLMAP's model in that of the map."""
@@ -17,6 +18,7 @@ SCENE = "scene.toml"
 """Scene file of the map's own images."""
 LENS = "lens.toml"
 """Calibration file of a lens that the map's images told."""
+COMMENT_WIDTH = 110
 UNITS_UNKNOWN = 'units = "unknown"             # lengths are told in units of the map'
 EVERY = 4
 """Every fourth image of the map is a query of the scene file, localized against the others."""
@@ -96,11 +98,12 @@ def _camera(camera: Camera) -> list[str]:
     return [f"{key} = {toml_value(value)}" for key, value in camera.to_dict().items()]
 
 
-def write_lenses(folder: Path, cameras: Mapping[str, Camera]) -> None:
-    """Write calibration files of cameras by name: ``lens.toml`` of that without one. Raises ``OSError``."""
-    for name, camera in cameras.items():
+def write_lenses(folder: Path, lenses: Mapping[str, CalibratedLens]) -> None:
+    """Write calibration files of lenses by name: ``lens.toml`` of that without one. Raises ``OSError``."""
+    for name, (camera, how) in lenses.items():
         path = folder / (f"lens_{name}.toml" if name else LENS)
-        path.write_text("\n".join(["[camera]", *_camera(camera)]) + "\n", encoding="utf-8")
+        about = [f"# {line}" for line in wrap(how, COMMENT_WIDTH)]
+        path.write_text("\n".join([*about, "[camera]", *_camera(camera)]) + "\n", encoding="utf-8")
 
 
 def write_new_scene(head: MapHead, folder: Path, new_images: NewImages, camera: Camera) -> Path:

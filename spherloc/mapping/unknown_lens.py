@@ -61,20 +61,20 @@ def find_lens(paths: Sequence[Path], size: tuple[int, int], tell: Tell) -> tuple
     except (ValueError, CalibrationError):
         raise InputError("no lens fits the matches between them") from None
     half_rad = float(lens.angles(np.array([rim.radius]))[0])
-    if half_rad < MIN_HALF_RAD:
-        raise InputError("their lens is not a wide one, as far as the matches between them tell")
     if off_rad > MAX_OFF_RAD:
         raise InputError(
-            "they do not tell their lens: what two halves of them tell differs by "
-            f"{np.degrees(off_rad):.1f}°, as where a camera only went straight ahead; add some between which it was "
-            "turned"
+            f"they do not tell their lens: lenses that differ by {np.degrees(off_rad):.1f}° fit them or halves of "
+            "them, as where a camera only went straight ahead; add some that were taken with the camera turned"
         )
+    if half_rad < MIN_HALF_RAD:
+        raise InputError(f"their lens seems to see {2.0 * np.degrees(half_rad):.0f}° only, and is no fisheye")
     field_rad = 2.0 * float(lens.angles(np.array([fit.radii_px.max()]))[0])
     return (
         camera,
         f"There was no calibration, so the lens was calibrated by {fit.matches:,} matches between the photographs, "
-        f"over a field of view of {np.degrees(field_rad):.0f}°. Two halves of them tell lenses that differ from it by "
-        f"{np.degrees(off_rad):.1f}° at most.",
+        f"which are spread over {np.degrees(field_rad):.0f}° of its view. Lenses that fit as well, or halves of them, "
+        f"give directions that differ by {np.degrees(off_rad):.1f}° at most; {np.degrees(MAX_OFF_RAD):.0f}° would be "
+        "too much.",
     )
 
 

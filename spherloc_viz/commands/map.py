@@ -20,17 +20,18 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError, SpherlocError, StoppedError, reason, show
-from spherloc.files import is_image, names_in
+from spherloc.files import is_folder, is_image, names_in
 from spherloc.frontend import trained
 from spherloc.frontend.features import FeatureOptions
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.matching import MatchOptions
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
-from spherloc.images import read_size
+from spherloc.images import check_image, read_size
 from spherloc.mapping.advice import advice, for_a_page
 from spherloc.mapping.make import Map, ScaleMeasurement, make_map
 from spherloc.mapping.photographs import (
+    CalibratedLens,
     LensFinder,
     NewImages,
     Photographs,
@@ -86,7 +87,7 @@ def make(
     with _stages() as tell, _compiled_for(new_images):
         if video is not None:
             _take_frames(*video, folder, tell)
-        found = photographs(folder, cameras, masks, panorama, _lens_finder(tell))
+        found = photographs(folder, cameras, masks, panorama, _lens_finder(tell, new_images))
         if positions is not None:
             measured = ScaleMeasurement(positions=read_positions(positions, found.views))
         stated = None if gravity is None else read_stated_gravity(*gravity, found.views)
@@ -123,13 +124,26 @@ def make(
     return 0 if len(made.written.poses) == len(found.views) else 1
 
 
-def _lens_finder(tell: Tell) -> LensFinder:
-    def find(paths: Sequence[Path], size: tuple[int, int]) -> tuple[Camera, str]:
+def _lens_finder(tell: Tell, new_images: Path | None) -> LensFinder:
+    """What calibrates a lens by its photographs and by the new images of their size."""
+
+    def find(paths: Sequence[Path], size: tuple[int, int]) -> CalibratedLens:
         from spherloc.mapping.unknown_lens import find_lens
 
-        return find_lens(paths, size, tell)
+        more: list[Path] = []
+        if new_images is not None and is_folder(new_images):
+            new = [new_images / name for name in names_in(new_images) if is_image(name)]
+            more = [path for path in new if _has_size(path, size)]
+        return find_lens([*paths, *more], size, tell)
 
     return find
+
+
+def _has_size(path: Path, size: tuple[int, int]) -> bool:
+    try:
+        return check_image(path) == size
+    except InputError:
+        return False
 
 
 def _write(report: Path, made: Map, found: Photographs) -> None:
@@ -231,7 +245,7 @@ def _kind(views: Sequence[View]) -> str:
         return f"images of {len(different)} cameras"
     (camera,) = different.values()
     size = f"{camera.width} x {camera.height} pixels"
-    return f"panoramas of {size}" if isinstance(camera, Equirectangular) else f"{camera.model} images of {size}"
+    return f"panoramas of {size}" if isinstance(camera, Equirectangular) else f"images of {size}, {camera.model}"
 
 
 def scale_of_words(words: str) -> ScaleMeasurement:
@@ -260,7 +274,7 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
     report = output / REPORT
     with for_a_page():
         try:
-            found = photographs(folder, {}, find_lens=_lens_finder(_progress))
+            found = photographs(folder, {}, find_lens=_lens_finder(_progress, None))
             measured = scale_of_words(scale)
             made = make_map(found.views, folder, output, measured, None, _progress, how=how_of())
             _write(report, made, found)
