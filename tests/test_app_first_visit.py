@@ -65,7 +65,7 @@ def test_every_run_opens_at_its_ring_and_has_four_moments(estimator: str) -> Non
     has_ring = any(item.layer == "yaw ring" for item in paint(trace, opening_step(headings)).scene)
     assert has_ring == any(heading.key in ("yaw-clique", "consensus-bound") for heading in headings)
     assert has_ring or key == "outcome"
-    found = re.fullmatch(r'<div hidden data-introduction="([^"]*)"></div>', introduction_html(headings))
+    found = re.fullmatch(r'<div hidden data-introduction="([^"]*)"></div>', introduction_html(headings, key))
     assert found is not None
     told = json.loads(unescape(found[1]))
     shown = [moment["step"] for moment in told["moments"]]

@@ -68,13 +68,14 @@ def opening_step(steps: Sequence[StepHeading]) -> int:
     return next((keys.index(key) for key in OPENING if key in keys), len(keys) - 1)
 
 
-def introduction_html(steps: Sequence[StepHeading]) -> str:
-    """What the page's script reads, put on the page once there is something to see."""
+def introduction_html(steps: Sequence[StepHeading], end: str) -> str:
+    """What the page's script reads, put on the page once there is something to see; at its end the page goes to the
+    step with the key ``end``."""
     keys = [step.key for step in steps]
     moments = []
     for wanted, title, words in MOMENTS:
         key = next((key for key in wanted if key in keys), keys[-1])
         title, words = BY_SAMPLES.get(key, (title, words))
         moments.append({"step": key, "title": title, "words": words})
-    told = {"moments": moments, "end": keys[opening_step(steps)]}
+    told = {"moments": moments, "end": end}
     return f'<div hidden data-introduction="{escape(json.dumps(told))}"></div>'

@@ -126,7 +126,7 @@ class LeftPanels:
         for widget, html in ((self._front, front), (self._summary, summary), (self._outcome, ending)):
             update_widget(widget, content=html)
         if not self._introduction.content:
-            self._introduction.content = introduction_html(steps(run.trace))
+            self._introduction.content = introduction_html(steps(run.trace), picture.step.key)
 
     def open_tab(self, tab: str, elsewhere: str = "") -> None:
         """Bring a view to the front, and a tab of another panel, once: then it is the person's to choose."""
