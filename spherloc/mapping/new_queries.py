@@ -71,7 +71,11 @@ def _mapped(model_folder: Path, images: Path) -> Photographs:
     """The images of the map with their cameras; where it has several, as the folder of the images tells them."""
     model = read_model(model_folder)
     views = tuple(View(one.name, model.camera(one.camera_id), images / one.name) for one in model.images.values())
-    return with_cameras(images, {}) if len(cameras_of(views)) > 1 else Photographs(views, (), {})
+    if len(cameras_of(views)) == 1:
+        return Photographs(views, (), {})
+    told = with_cameras(images, {})
+    # Cameras that the photographs told are by their folders.
+    return told if told.views else Photographs(views, (), {Path(view.name).parts[0]: view.camera for view in views})
 
 
 def _section(table: Mapping[str, Any], name: str, where: str) -> list[str]:

@@ -9,6 +9,8 @@ from textwrap import wrap
 from typing import Any
 
 from spherloc.cameras.base import Camera
+from spherloc.cameras.calibration import load_camera
+from spherloc.errors import SpherlocError
 from spherloc.frontend.view import View
 from spherloc.mapping.photographs import CalibratedLens, NewImages, cameras_of
 
@@ -98,10 +100,25 @@ def _camera(camera: Camera) -> list[str]:
     return [f"{key} = {toml_value(value)}" for key, value in camera.to_dict().items()]
 
 
+def lens_path(folder: Path, name: str) -> Path:
+    """The calibration file of a lens in the folder of a map: ``lens.toml`` of that without a name."""
+    return folder / (f"lens_{name}.toml" if name else LENS)
+
+
+def kept_lens(path: Path) -> Camera | None:
+    """The lens that ``write_lenses`` wrote; None if the file is missing or damaged."""
+    try:
+        return load_camera(path)
+    except SpherlocError:
+        return None
+
+
 def write_lenses(folder: Path, lenses: Mapping[str, CalibratedLens]) -> None:
-    """Write calibration files of lenses by name: ``lens.toml`` of that without one. Raises ``OSError``."""
+    """Write the ``lens_path`` of lenses by name where another is there or none; raises ``OSError``."""
     for name, (camera, how) in lenses.items():
-        path = folder / (f"lens_{name}.toml" if name else LENS)
+        path = lens_path(folder, name)
+        if kept_lens(path) == camera:
+            continue
         about = [f"# {line}" for line in wrap(how, COMMENT_WIDTH)]
         path.write_text("\n".join([*about, "[camera]", *_camera(camera)]) + "\n", encoding="utf-8")
 

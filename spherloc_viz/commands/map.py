@@ -41,7 +41,7 @@ from spherloc.mapping.photographs import (
     photographs,
 )
 from spherloc.mapping.positions import read_positions
-from spherloc.mapping.scene_files import LENS, write_lenses
+from spherloc.mapping.scene_files import LENS, kept_lens, lens_path, write_lenses
 from spherloc.mapping.stated_gravity import read_stated_gravity
 from spherloc.mapping.upright import Tell
 from spherloc.registry import require
@@ -87,7 +87,7 @@ def make(
     with _stages() as tell, _compiled_for(new_images):
         if video is not None:
             _take_frames(*video, folder, tell)
-        found = photographs(folder, cameras, masks, panorama, _lens_finder(tell, new_images))
+        found = photographs(folder, cameras, masks, panorama, _lens_finder(tell, folder, target, new_images))
         if positions is not None:
             measured = ScaleMeasurement(positions=read_positions(positions, found.views))
         stated = None if gravity is None else read_stated_gravity(*gravity, found.views)
@@ -124,12 +124,18 @@ def make(
     return 0 if len(made.written.poses) == len(found.views) else 1
 
 
-def _lens_finder(tell: Tell, new_images: Path | None) -> LensFinder:
-    """What calibrates a lens by its photographs and by the new images of their size."""
+def _lens_finder(tell: Tell, folder: Path, target: Path, new_images: Path | None) -> LensFinder:
+    """What calibrates a lens of the photographs in ``folder``, or in a folder there, by them and by the new images of
+    their size; a lens that is kept in ``target``, the folder of the map, is taken instead."""
 
     def find(paths: Sequence[Path], size: tuple[int, int]) -> CalibratedLens:
         from spherloc.mapping.unknown_lens import find_lens
 
+        place = paths[0].parent
+        path = lens_path(target, "" if place == folder else place.name)
+        kept = kept_lens(path)
+        if kept is not None and (kept.width, kept.height) == size:
+            return kept, f"The lens is that of {path}, which the photographs told; without this file they tell it anew."
         more: list[Path] = []
         if new_images is not None and is_folder(new_images):
             new = [new_images / name for name in names_in(new_images) if is_image(name)]
@@ -274,7 +280,7 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
     report = output / REPORT
     with for_a_page():
         try:
-            found = photographs(folder, {}, find_lens=_lens_finder(_progress, None))
+            found = photographs(folder, {}, find_lens=_lens_finder(_progress, folder, output, None))
             measured = scale_of_words(scale)
             made = make_map(found.views, folder, output, measured, None, _progress, how=how_of())
             _write(report, made, found)

@@ -1,6 +1,7 @@
 """Fisheyes without a calibration: their image circle, their lens by matches, and what is said where those do not do."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,7 @@ from spherloc.mapping.lens_fit import Circle, RadialLens, fit_lens
 from spherloc.mapping.photographs import photographs
 from spherloc.mapping.scene_files import LENS, write_lenses
 from spherloc.mapping.unknown_lens import MAX_OFF_RAD, find_lens
+from spherloc_viz.commands.map import _lens_finder
 
 TRUE = KannalaBrandt(900, 700, 270.0, 270.0, 458.0, 343.0, (-1 / 24, 1 / 1920, 0.0, 0.0))
 RIM = Circle(450.0, 350.0, float(np.hypot(450, 350)))
@@ -131,6 +133,25 @@ def test_photographs_without_a_calibration_are_given_the_lens_that_they_tell(tmp
     told = r"3 of 400 x 300 pixels, 1 of 300 x 300 pixels, .* have no calibration, and they are too few\. Or .*--camera"
     with pytest.raises(InputError, match=told):
         photographs(tmp_path, {}, find_lens=refuses)
+
+
+def test_a_map_that_is_made_again_keeps_its_lens(tmp_path):
+    """Of its images and of those in a folder, if they have the size; the file keeps how it was found."""
+    lens = KannalaBrandt(400, 300, 90.0, 90.0, 200.0, 150.0, (0.01, 0.0, 0.0, 0.0))
+    write_lenses(tmp_path, {"": (lens, "It was found."), "left": (replace(lens, fx=95.0), "It was found, too.")})
+    images = tmp_path / "images"
+    find = _lens_finder(lambda *_: None, images, tmp_path, None)
+    found, how = find([images / "a.png"], (400, 300))
+    assert found == lens and str(tmp_path / LENS) in how
+    assert find([images / "left" / "a.png"], (400, 300))[0] == replace(lens, fx=95.0)
+    write_lenses(tmp_path, {"": (lens, how)})
+    assert (tmp_path / LENS).read_text().startswith("# It was found.\n")
+    for name, size in (("a.png", (400, 301)), ("right/a.png", (400, 300))):
+        with pytest.raises(InputError, match="too few to calibrate"):
+            find([images / name], size)
+    (tmp_path / LENS).write_text("[camera]\nmodel = 3")
+    with pytest.raises(InputError, match="too few to calibrate"):
+        find([images / "a.png"], (400, 300))
 
 
 def test_what_is_said_where_photographs_do_not_tell_their_lens(tmp_path, rng):
