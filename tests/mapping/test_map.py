@@ -394,6 +394,13 @@ def test_a_map_of_the_cameras_of_a_rig(rig, tmp_path):
     assert "of 2 cameras" in _kind(found.views)
     path, _ = add_new_images(made.written.scene, folder)
     assert {view.name for view in load_scene(path).queries} == set(poses)
+    for name in ("front", "left"):  # as of lenses that the photographs told
+        (folder / f"{name}.toml").rename(tmp_path / f"{name}.toml")
+    path, _ = add_new_images(made.written.scene, folder)
+    told = {view.name: view.camera.width for view in load_scene(path).queries}
+    assert told == {name: 480 if name.startswith("front") else 512 for name in poses}
+    for name in ("front", "left"):
+        (tmp_path / f"{name}.toml").rename(folder / f"{name}.toml")
 
 
 def test_a_job_tells_what_went_wrong_in_a_line(tmp_path, rng, capsys):
