@@ -91,7 +91,7 @@ class RadialLens:
         return theta
 
     def slope(self, theta: FloatArray) -> FloatArray:
-        """dr / dtheta over f, never near zero."""
+        """(N,) dr / dtheta over f, never near zero, at angles (N,)."""
         return np.maximum(1.0 + 3.0 * self.k1 * theta**2 + 5.0 * self.k2 * theta**4, _MIN_SLOPE)
 
     def bearings(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
