@@ -9,6 +9,7 @@ lenses that fit nearly as well differ by says how well the lens is known.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from math import pi
@@ -117,7 +118,7 @@ class Expected:
     k1: float = 0.0
 
     def off(self, lens: RadialLens) -> FloatArray:
-        """How far a lens (5 or 6 numbers) is from it, in pixels."""
+        """(4,) how far a lens is from it, in pixels, or (5,) where an angle at the rim is expected."""
         sd_px = SD_CENTRE * self.rim.radius
         off = [
             (lens.k1 - self.k1) / SD_K[0],
@@ -157,9 +158,13 @@ def fit_lens(
     expected = Expected(rim, float(CIRCLE_HALF_RAD) if is_circle else None)
     few = every[:FIRST_PAIRS]
     tried: list[LensFit] = []
-    for lens in _starts(pycolmap, every, rim, CIRCLE_FIELDS_RAD if is_circle else HALF_FIELDS_RAD):
-        tried.append(_refined(pycolmap, few, lens, expected, FIRST_BOUNDS_PX))
-        tell(STAGE, len(tried), FITS)
+    starts = _starts(pycolmap, every, rim, CIRCLE_FIELDS_RAD if is_circle else HALF_FIELDS_RAD)
+    for done, lens in enumerate(starts, start=1):
+        with suppress(ValueError):
+            tried.append(_refined(pycolmap, few, lens, expected, FIRST_BOUNDS_PX))
+        tell(STAGE, done, FITS)
+    if not tried:
+        raise ValueError("hardly any match fits a motion of the camera, whatever the lens")
     best, *others = sorted(tried, key=lambda fit: -fit.score)
     whole = _refined(pycolmap, every, best.lens, expected, BOUNDS_PX)
     tell(STAGE, FITS - 2, FITS)
@@ -170,7 +175,7 @@ def fit_lens(
 
     alike = []
     for other in others:
-        if other.score > NEARLY * best.score and off_rad(other) > 0.0:
+        if other.score > NEARLY * best.score:
             other = _refined(pycolmap, few, other.lens, expected, BOUNDS_PX)
             same = _refined(pycolmap, few, whole.lens, expected, BOUNDS_PX[-1:])
             alike += [other] if other.score > NEARLY * same.score else []
