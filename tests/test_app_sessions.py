@@ -19,7 +19,8 @@ from spherloc.errors import RecordingError
 from spherloc.estimators import estimate
 from spherloc.geometry import align_to_down, camera_centre
 from spherloc.trace import Trace
-from spherloc_viz.app import compilation
+from spherloc_viz import layers
+from spherloc_viz.app import compilation, run_display
 from spherloc_viz.app import session as session_module
 from spherloc_viz.app.catalog import Catalog, Run
 from spherloc_viz.app.compilation import Compilation
@@ -31,6 +32,7 @@ from spherloc_viz.app.stage import views
 from spherloc_viz.app.text import HIDDEN
 from spherloc_viz.app.web.touch import Touch
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
+from spherloc_viz.layers.primitives import Picture
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.storage.recorder import Ended
 from tests.connected_page import HELLO, Wire
@@ -224,6 +226,31 @@ def test_stepping_solves_nothing(house: House, monkeypatch: pytest.MonkeyPatch) 
     page.set(session._controls.display._layers["map"], False)
     until(lambda: not session._display.canvas._painter._drawn["map/points"][0].visible)
     assert len(house.notes.traces) == 1
+
+
+def test_steps_around_the_one_at_hand_are_painted_before_they_are_asked_for(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page, session = house.visit()
+    painted, paint_anew = [], layers._painted
+
+    def noted(timeline: Any, index: int, told: bool) -> Picture:
+        painted.append(index)
+        return paint_anew(timeline, index, told)
+
+    monkeypatch.setattr(layers, "_painted", noted)
+    page.set(session._controls.scene._simulation._noise, 1.5)  # a run of which nothing is painted
+    until(lambda: len(painted) == 1 + run_display.MAX_AHEAD)
+    last = len(session._display.panels.steps._choice.options) - 1
+    assert painted == list(range(last, last - run_display.MAX_AHEAD - 1, -1)), "the nearest first"
+    session._display.panels.steps.go("yaw-candidate-1")
+    until(lambda: len(painted) > 30)
+    made = dict(session._display.panels._yaw._made)
+    session._display.panels.steps.go("yaw-candidate-2")
+    until(lambda: session._display.step_key == "yaw-candidate-2")
+    place = next(k for k, step in enumerate(layers.steps(session._run.trace)) if step.key == "yaw-candidate-2")
+    assert painted.count(place) == 1, "it was painted when it was not asked for, and not again"
+    assert session._display.panels._yaw._html.content in {content for content, _ in made.values()}
 
 
 def test_the_view_of_balls_goes_to_the_step_that_shows_them(house: House) -> None:

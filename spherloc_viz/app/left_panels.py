@@ -23,7 +23,7 @@ from spherloc_viz.app.text import legend_html, opening_card_html, opening_html, 
 from spherloc_viz.app.web.touch import READY, Touch, Touches, pixels_of, seen_views
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers import graph_begins, steps
-from spherloc_viz.layers.primitives import Picture, Table
+from spherloc_viz.layers.primitives import Chart, Picture, Table
 
 
 class LeftPanels:
@@ -100,9 +100,7 @@ class LeftPanels:
         self.steps.show(picture.step, playing, tables)
         seen = self._seen
         if "Yaw" in seen:
-            of_yaw = picture.charts if hidden or picture.step.key.startswith("yaw-") else ()
-            chart = next((chart for chart in of_yaw if chart.name == "yaw"), None)
-            self._yaw.draw(run.trace, picture.step.key, selected, kept, hidden, chart)
+            self._yaw.draw(run.trace, picture.step.key, selected, kept, hidden, _yaw_chart(picture, hidden))
         if "Graph" in seen:
             self.graph.draw(picture.graph, graph_begins(run.trace), selected, kept, hidden)
         if "Charts" in seen:
@@ -127,6 +125,11 @@ class LeftPanels:
             update_widget(widget, content=html)
         if not self._introduction.content:
             self._introduction.content = introduction_html(steps(run.trace), picture.step.key)
+
+    def prepare(self, run: Run, picture: Picture, selected: tuple[int, ...], hidden: bool) -> None:
+        """Make what ``draw`` will show of another step of the run that is shown."""
+        if "Yaw" in self._seen:
+            self._yaw.prepare(run.trace, picture.step.key, selected, run.kept, hidden, _yaw_chart(picture, hidden))
 
     def open_tab(self, tab: str, elsewhere: str = "") -> None:
         """Bring a view to the front, and a tab of another panel, once: then it is the person's to choose."""
@@ -179,6 +182,12 @@ class LeftPanels:
     def diagnose(self, html: str) -> None:
         """Show the newest diagnosis."""
         update_widget(self._diagnosis, content=html)
+
+
+def _yaw_chart(picture: Picture, hidden: bool) -> Chart | None:
+    """The chart of the yaw as of a step about yaws, and at all steps if results are ``hidden``; None elsewhere."""
+    of_yaw = picture.charts if hidden or picture.step.key.startswith("yaw-") else ()
+    return next((chart for chart in of_yaw if chart.name == "yaw"), None)
 
 
 PROJECTOR_SHARE = 0.4

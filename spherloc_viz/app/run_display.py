@@ -1,7 +1,9 @@
 """All that a page shows of a run: the canvas, the story beside it, and the card of what is selected."""
 
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -37,6 +39,9 @@ from spherloc_viz.layers.where_taken import where_taken
 from spherloc_viz.layers.withheld import ANSWERS, OUTCOME, untold
 
 START_THEME = "dark"
+MAX_AHEAD = 22
+"""Number of steps around the one at hand that are painted before they are asked for; less than what is kept of a run's
+pictures."""
 NAMED_AT = frozenset({"Matches", "Outcome"})
 """Stages at whose steps references have their names in the canvas: elsewhere these cover what the step is about."""
 
@@ -107,6 +112,8 @@ class RunDisplay:
         self._around: tuple[MapScene, FloatArray, tuple[SceneItem, ...]] | None = None
         """A scene, how its map is turned, and its points and references."""
         self._outcome: tuple[Trace, Judgement | None, Table] | None = None
+        self._to_prepare: deque[Callable[[], None]] = deque()
+        """What paints the steps around the one at hand, the nearest first."""
         self._scene_of = places.scene_of
         self._theme = START_THEME
         self._redraw = places.redraw
@@ -233,7 +240,21 @@ class RunDisplay:
             self.panels.diagnose("" if hidden else _diagnosed_html(trace, diagnosis, index))
             self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, not told)
         self._client.flush()
+        nearest = sorted(range(len(timeline)), key=lambda other: (abs(other - index), index - other))
+        self._to_prepare = deque(
+            partial(self._paint_ahead, run, other, selected, told) for other in nearest[1 : 1 + MAX_AHEAD]
+        )
         return self.canvas.check() if pause is None else pause
+
+    def prepare(self) -> bool:
+        """Paint one of the steps that may be asked for next; false if there is none that is not painted."""
+        if not self._to_prepare:
+            return False
+        self._to_prepare.popleft()()
+        return True
+
+    def _paint_ahead(self, run: Run, index: int, selected: tuple[int, ...], told: bool) -> None:
+        self.panels.prepare(run, paint(run.trace, index, told), selected, not told)
 
     def _opens_photographs(self, run: Run) -> bool:
         """Whether this is the first run on the page of a map of photographs, of which is asked first where they were

@@ -1,5 +1,6 @@
 """One browser client: its own widgets, canvas, run and threads."""
 
+import math
 import secrets
 import time
 from collections import deque
@@ -53,6 +54,9 @@ VIEWER_STILL_S = 0.3
 DIAGNOSE_AFTER_S = 0.2
 """A diagnosis often takes longer than a run, so it starts only when the picture has not changed for this long."""
 
+PREPARE_AFTER_S = 0.15
+"""Steps around the one at hand are painted ahead when nothing was drawn for this long."""
+
 T = TypeVar("T")
 
 
@@ -97,6 +101,8 @@ class Session:
         self._diagnosed: tuple[Trace, Diagnosis] | None = None
         self._runs = PageRuns(services.recorder, self._catalog)
         self.notices = Notices(client)
+        self._due_s = -math.inf
+        """When the page is to be drawn again although nothing has changed, seconds of a monotonic clock."""
         self._built = False
         """Whether all widgets are there: the first of them may be used before the last one is made."""
         left_px, right_px = panel_widths_px(client.camera.image_width)
@@ -468,7 +474,11 @@ class Session:
         return self._catalog.known_mesh(run.request.scene.scene)
 
     def _show(self, asked: bool) -> float | None:
-        """The page thread's job: show the step at hand of the newest run."""
+        """The page thread's job: show the step at hand of the newest run; while there is nothing to show, paint the
+        steps around it ahead."""
+        left = self._due_s - time.monotonic()
+        if not asked and left > 0.0:
+            return 0.0 if self._display.prepare() else (left if left < math.inf else None)
         answers, followed, run = self._answers, self._followed, self._run
         if run is None:
             self._display.draw_map()
@@ -484,7 +494,8 @@ class Session:
         self._viewer.ask()
         if diagnosis is None:
             self._diagnoser.ask()
-        return pause
+        self._due_s = math.inf if pause is None else time.monotonic() + pause
+        return PREPARE_AFTER_S if pause is None else min(pause, PREPARE_AFTER_S)
 
     def _write_address(self, run: Run) -> None:
         """Write what the page shows into the address of the browser."""

@@ -278,6 +278,9 @@ UNTOLD = "Answers are hidden: the estimate, and which arcs are of right matches,
 PEAK, WHOLE = "Zoom to the peak", "All yaws"
 MAX_MADE = 24
 """Largest number of a run's contents that are kept."""
+Question = tuple[str, tuple[int, ...], Window | None, bool, Chart | None]
+"""What the content depends on, for a run: key of the step, if it has a content of its own; indices of the selected
+matches; window that was chosen; whether results are left out; chart of the step."""
 MIN_DRAG = 0.012
 """Share of the plot that a press must cross to count as a drag."""
 
@@ -294,10 +297,10 @@ class YawView:
         self._known: tuple[Trace, YawStory] | None = None
         self._arcs: tuple[Trace, tuple[int, ...], PairArcs] | None = None
         self._made_of: Trace | None = None
-        self._made: dict[tuple, tuple[str, Window]] = {}
-        """The contents that were made last for that run, for those who walk back and forth: with their window of the
-        peak, by what was asked for."""
-        self._drawn: tuple | None = None
+        self._made: dict[Question, tuple[str, Window]] = {}
+        """The contents that were made last for that run, for those who walk back and forth, and ahead: with their
+        window of the peak."""
+        self._drawn: Question | None = None
         self._buttons = gui.add_button_group("Yaw", (PEAK, WHOLE))
         self._html = gui.add_html("")
         self._buttons.on_click(self._click)
@@ -318,28 +321,16 @@ class YawView:
         about yaws, whose curve then takes the place of the run's. ``hidden`` leaves out the results, among them that
         curve of the run. Sends nothing if nothing changed.
         """
-        with self._lock:
-            wanted = self._wanted
-        of_step = step_key if step_chart is not None else self._hypothesis(trace, step_key)
-        asked = (of_step, selected, wanted, hidden, step_chart)
-        if self._made_of is not trace:
-            self._made_of, self._made, self._drawn = trace, {}, None
+        asked = self._question(trace, step_key, selected, hidden, step_chart)
         if asked == self._drawn:
             return
-        if hidden and step_chart is None:
-            content = status_html(WITHHELD)
-        else:
-            content, peak = self._made[asked] = self._made.pop(asked, None) or self._make(
-                trace, step_key, selected, kept, hidden, step_chart, wanted
-            )
-            if len(self._made) > MAX_MADE:
-                del self._made[next(iter(self._made))]
-            with self._lock:
-                self._peak = peak
+        content, peak = self._content(asked, trace, step_key, kept)
+        with self._lock:
+            self._peak = peak
         update_widget(self._html, content=content)
         self._drawn = asked
 
-    def _make(
+    def prepare(
         self,
         trace: Trace,
         step_key: str,
@@ -347,9 +338,33 @@ class YawView:
         kept: NDArray[np.int64],
         hidden: bool,
         step_chart: Chart | None,
-        wanted: Window | None,
-    ) -> tuple[str, Window]:
-        """The content of the panel, whose window is ``wanted`` or else that of the peak; and that of the peak."""
+    ) -> None:
+        """Make what ``draw`` will show of another step of that run."""
+        self._content(self._question(trace, step_key, selected, hidden, step_chart), trace, step_key, kept)
+
+    def _question(
+        self, trace: Trace, step_key: str, selected: tuple[int, ...], hidden: bool, step_chart: Chart | None
+    ) -> Question:
+        """What the content of the panel depends on, for a run."""
+        if self._made_of is not trace:
+            self._made_of, self._made, self._drawn = trace, {}, None
+        of_step = step_key if step_chart is not None else self._hypothesis(trace, step_key)
+        with self._lock:
+            return of_step, selected, self._wanted, hidden, step_chart
+
+    def _content(self, asked: Question, trace: Trace, step_key: str, kept: NDArray[np.int64]) -> tuple[str, Window]:
+        """The content of the panel, made or kept, and the window of the peak."""
+        _, _, _, hidden, step_chart = asked
+        if hidden and step_chart is None:
+            return status_html(WITHHELD), self._peak
+        self._made[asked] = made = self._made.pop(asked, None) or self._make(asked, trace, step_key, kept)
+        if len(self._made) > MAX_MADE:
+            del self._made[next(iter(self._made))]
+        return made
+
+    def _make(self, asked: Question, trace: Trace, step_key: str, kept: NDArray[np.int64]) -> tuple[str, Window]:
+        """The content of the panel, whose window is the wanted one or else that of the peak; and that of the peak."""
+        _, selected, wanted, hidden, step_chart = asked
         story = self._story(trace)
         arcs = NO_ARCS if hidden else arcs_of_step(self._arcs_of(trace, selected), trace, step_key)
         if step_chart is not None:
