@@ -21,8 +21,8 @@ from spherloc_viz.layers.primitives import Chart, Curve, Label, SceneItem, Segme
 PALETTE: tuple[style.RGB, ...] = (
     (150, 205, 20),
     (255, 135, 60),
-    (90, 75, 235),
     (20, 120, 130),
+    (90, 75, 235),
     (150, 100, 60),
     (255, 205, 170),
     (155, 15, 75),
