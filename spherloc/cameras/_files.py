@@ -1,14 +1,18 @@
 """Reads calibration files as tables, lists and numbers, with errors that name the place of a wrong value."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from spherloc.cameras._checks import coefficients, finite, located
-from spherloc.errors import MAX_REASON, CalibrationError, reason, shorten, show
-from spherloc.files import read_file
+from spherloc.errors import MAX_REASON, CalibrationError, InputError, reason, shorten, show
+from spherloc.files import names_in, read_file
+
+CALIBRATION_NAME = re.compile(r"(calib|cam|lens|sensors|transforms).*\.(json|toml|txt|ya?ml)$", re.IGNORECASE)
+"""Usual names of calibration files."""
 
 MAX_FILE_BYTES = 256 * 1024
 """Largest calibration file: they take a few kilobytes, and the YAML reader takes minutes for megabytes."""
@@ -47,12 +51,23 @@ def read_text(path: Path) -> str:
         content = read_file(path, MAX_FILE_BYTES)
     except FileNotFoundError:
         raise CalibrationError("there is no such file: give the path of a calibration file.") from None
+    except IsADirectoryError:
+        raise CalibrationError(f"is a folder: give the calibration file itself{_such_as(path)}.") from None
     except OSError as error:
         raise CalibrationError(f"cannot be read ({reason(error)}): check the path and its permissions.") from None
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise UnrecognisedError(f"byte {error.start} is not UTF-8 text: {KNOWN}.") from None
+
+
+def _such_as(folder: Path) -> str:
+    """A file in a folder that is a calibration by its name, as the end of a sentence; empty if there is none."""
+    try:
+        names = [name for name in names_in(folder) if CALIBRATION_NAME.search(name)]
+    except InputError:
+        return ""
+    return f", such as {folder / names[0]}" if names else ""
 
 
 def parse_yaml(text: str) -> Any:

@@ -97,6 +97,8 @@ THUMBNAIL_PX = 240
 MAX_THUMBNAILS = 40
 MAX_NAMED = 30
 """Largest number of images whose names stand in the picture from above."""
+TOGETHER, MAX_LINES = 0.02, 4
+"""Images that are closer than this share of the extent of all have their names under each other, at most so many."""
 MAX_POINTS = 20_000
 CLOSE = 0.15
 """If the images lie within this share of the picture, a second one shows them alone."""
@@ -258,13 +260,27 @@ def _from_above(made: Map, cameras: Collection[Camera], unit: str) -> str:
         axes.plot(walk[:, 0], walk[:, 1], color="#d08a1c", linewidth=0.8)
     axes.scatter(centres[:, 0], centres[:, 1], s=28, c="#c0392b", zorder=3)
     if len(centres) <= MAX_NAMED:
-        for name, centre in zip(made.written.poses, centres, strict=True):
-            axes.text(centre[0], centre[1], f"  {name}", fontsize=8, va="center", parse_math=False, clip_on=True)
+        for (x, y), words in words_at(centres[:, :2], list(made.written.poses)):
+            axes.text(x, y, words, fontsize=8, va="center", parse_math=False, clip_on=True)
     axes.set(xlabel=unit, ylabel=unit)
     axes.margins(0.2)
     file = io.BytesIO()
     figure.savefig(file, format="png", metadata={"Software": None})
     return _data("png", file.getvalue())
+
+
+def words_at(places: FloatArray, names: list[str]) -> list[tuple[tuple[float, float], str]]:
+    """Where (x, y) which words stand for images at places (N, 2): the names of those at one place under each other."""
+    apart, free = TOGETHER * float(np.ptp(places, axis=0).max()), np.ones(len(names), bool)
+    words = []
+    for k in range(len(names)):
+        there = np.flatnonzero(free & (np.abs(places - places[k]).max(axis=1) <= apart)) if free[k] else []
+        if len(there):
+            free[there] = False
+            lines = [f"  {names[other]}" for other in there[:MAX_LINES]]
+            lines += [f"  and {len(there) - MAX_LINES} more"] * (len(there) > MAX_LINES)
+            words.append(((float(places[k, 0]), float(places[k, 1])), "\n".join(lines)))
+    return words
 
 
 def _near(points: FloatArray, centres: FloatArray) -> np.ndarray:

@@ -1,6 +1,8 @@
 """``load_camera``: KITTI-360, Kalibr and the project's TOML; a damaged file is one sentence, never a crash."""
 
 import random
+import re
+from pathlib import Path
 
 import pytest
 from camera_samples import KITTI360_IMAGE_02, require_shared, sample
@@ -281,3 +283,12 @@ def test_random_bytes_are_one_sentence(refused):
     for length in range(200):
         refused(rng.randbytes(length + 1))
         refused(f"%YAML:1.0\n{''.join(rng.choices(': -[]{}&*!|>abc01.', k=length))}")
+
+
+def test_a_folder_is_no_calibration_and_the_sentence_names_one_in_it(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"is a folder: give the calibration file itself\.$"):
+        load_camera(tmp_path)
+    for name in ("map.txt", "lens.toml"):
+        (tmp_path / name).touch()
+    with pytest.raises(CalibrationError, match=rf"itself, such as {re.escape(str(tmp_path / 'lens.toml'))}\.$"):
+        load_camera(tmp_path)

@@ -46,7 +46,7 @@ from spherloc.mapping.written import _gravity
 from spherloc.problem import Problem
 from spherloc_viz.commands.image_commands import map as map_command
 from spherloc_viz.commands.map import _kind, _sizes, cameras_of_file, how_of, main, scale_of_words
-from spherloc_viz.commands.map_report import map_report, summary
+from spherloc_viz.commands.map_report import map_report, summary, words_at
 from tests.waiting import LIMIT_S
 
 IMAGES = ("reference_002", "reference_003", "reference_004", "reference_005", "reference_006")
@@ -782,3 +782,10 @@ def test_new_images_of_several_cameras(tmp_path, rng):
         scene = load_scene(tmp_path / "scene.toml")
         assert [(view.name, view.camera) for view in scene.queries] == [(view.name, view.camera) for view in views]
         assert not any("left out" in remark for remark in scene.remarks)
+
+
+def test_names_of_images_at_one_place_stand_under_each_other() -> None:
+    places = np.array([[0.0, 0.0], [10.0, 5.0], [0.1, -0.1], [10.0, 5.3]])
+    assert words_at(places, list("abcd")) == [((0.0, 0.0), "  a\n  c"), ((10.0, 5.0), "  b"), ((10.0, 5.3), "  d")]
+    ((_, words),) = words_at(np.zeros((6, 2)), list("abcdef"))
+    assert words.splitlines() == ["  a", "  b", "  c", "  d", "  and 2 more"]
