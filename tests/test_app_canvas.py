@@ -42,7 +42,9 @@ def test_a_page_that_arrives_late_sees_around_walls_that_came_meanwhile(
     picture = next(one for one in (paint(run.trace, k) for k in range(1, len(timeline))) if one.focus.view == "Sphere")
     places: list[dict[str, Any]] = []
     page.answer = lambda message: places.append(message) if message["type"].startswith("SetCamera") else None
-    shown = Canvas(page.handle, DisplayControls(page.handle.gui, print), lambda *_: None, lambda _: None, 0)
+    shown = Canvas(
+        page.handle, DisplayControls(page.handle.gui, print), lambda *_: None, lambda _: None, lambda *_: None, 0
+    )
 
     def placed(what: str) -> list[np.ndarray]:
         return [np.array(place[what]) for place in places if what in place]

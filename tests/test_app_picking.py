@@ -1,5 +1,7 @@
 """What a click or a rectangle on the canvas means: the projection is viser's, and the nearest thing wins."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from spherloc_viz import style
-from spherloc_viz.app.stage.picking import DOT_PX, LINE_PX, Viewer, inside, nearest, viewer_of
+from spherloc_viz.app.stage.picking import DOT_PX, LINE_PX, Viewer, inside, nearest, photograph, viewer_of
 from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.primitives import Balls, Points, Segments
 
@@ -25,9 +27,9 @@ class Camera:
         self.image_width, self.image_height, self.fov = width, height, fov
 
 
-def dots(*places: tuple[float, float, float], radius_m: float = 1e-4, layer: str = "map") -> Points:
+def dots(*places: tuple[float, float, float], radius_m: float = 1e-4) -> Points:
     count = len(places)
-    return Points("map/points", layer, np.array(places), one_color(style.INLIER, count), radius_m, np.arange(count))
+    return Points("map/points", "map", np.array(places), one_color(style.INLIER, count), radius_m, np.arange(count))
 
 
 def line(start: tuple[float, float, float], end: tuple[float, float, float], pair: tuple[int, int]) -> Segments:
@@ -124,10 +126,24 @@ def test_what_shows_no_correspondence_is_not_picked() -> None:
     for item in (
         Points(plain.name, plain.layer, plain.positions, plain.colors, 1.0),
         Segments("rays", "rays", np.array([[[-1.0, 0, 3], [1, 0, 3]]]), one_color(style.INLIER, 1), 2.0),
-        dots((0, 0, 5), layer="trajectory"),
+        replace(plain, ids=None, photographs=("first.jpg",)),
     ):
         assert pick(item) == ()
     viewer = Viewer(np.zeros(3), np.eye(3), np.ones(2), PIXEL)
-    assert inside([dots((0, 0, 5), layer="trajectory")], viewer, (0, 0), (1, 1)) == ()
+    assert inside([replace(plain, ids=None)], viewer, (0, 0), (1, 1)) == ()
     empty = Segments("rays", "rays", np.zeros((0, 2, 3)), one_color(style.INLIER, 0), 2.0, np.zeros((0, 2), np.int64))
     assert nearest([empty], np.zeros(3), AHEAD, PIXEL) == ()
+
+
+def test_the_dot_of_a_photograph_is_pressed_where_no_dot_of_a_match_is_nearer() -> None:
+    places, colors = np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 5.0]]), one_color(style.REFERENCE, 2)
+    taken = Points("cloud/references", "point cloud", places, colors, 0.01, photographs=("first.jpg", "second.jpg"))
+    around, match = balls(3.0), dots((1.02, 0.0, 5.0))
+
+    def pressed(at: tuple[float, float, float], *items: Points | Balls) -> tuple[str, str] | None:
+        return photograph(items, np.zeros(3), np.array(at), PIXEL)
+
+    assert pressed((1.0, 0.0, 5.0), taken, around) == ("point cloud", "second.jpg")
+    assert pressed((0.5, 0.0, 5.0), taken, around) is None
+    assert pressed((1.03, 0.0, 5.0), taken, match) is None and pick(taken, match, at=(1.03, 0.0, 5.0)) == (0,)
+    assert pick(taken, at=(1.0, 0.0, 5.0)) == (), "it is no match"

@@ -35,6 +35,7 @@ def test_points_far_away_are_left_out_and_references_stand_where_they_were_taken
     assert points.ids is None, "a press picks matches, not points of the map"
     poses = [view.cam_from_map for view in scene.references if view.cam_from_map is not None]
     np.testing.assert_allclose(dots.positions @ turn, [camera_centre(pose) for pose in poses], atol=1e-9)
+    assert dots.photographs == tuple(view.name for view in scene.references)
 
 
 def test_references_are_cameras_that_look_where_they_looked() -> None:

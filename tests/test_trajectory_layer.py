@@ -29,7 +29,7 @@ def test_dots_stand_where_cameras_were_found_and_have_the_colour_of_their_error(
     rows = [row(0, (0, 0, 0), (0, 0, 0)), row(1, (1, 0.5, 0), (1, 0, 0)), row(2, (2, 9, 0), (2, 0, 0))]
     dots, truth, errors = drawn(rows, turn)
     assert np.allclose(dots.positions, np.array([[0, 0, 0], [1, 0.5, 0], [2, 9, 0]]) @ turn.T)
-    assert dots.ids is not None and dots.ids.tolist() == [0, 1, 2]
+    assert dots.ids is None and dots.photographs == ("q0", "q1", "q2")
     assert [tuple(color) for color in dots.colors] == [style.ERROR_RAMP[0], style.ERROR_RAMP[-1], style.OUTLIER]
     assert len(truth.points) == 2 and np.allclose(truth.points[1], np.array([[1, 0, 0], [2, 0, 0]]) @ turn.T)
     assert np.allclose(np.linalg.norm(errors.points[:, 1] - errors.points[:, 0], axis=1), [0, 0.5, 9])
@@ -38,7 +38,7 @@ def test_dots_stand_where_cameras_were_found_and_have_the_colour_of_their_error(
 def test_failures_are_marked_where_they_should_be_and_gaps_are_left_open() -> None:
     rows = [row(0, (0, 0, 0), (0, 0, 0)), row(1, None, (1, 0, 0)), row(2, (2, 0, 0), None), row(3, None, None)]
     dots, truth, errors = drawn(rows, np.eye(3))
-    assert np.allclose(dots.positions, [[0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    assert np.allclose(dots.positions, [[0, 0, 0], [1, 0, 0], [2, 0, 0]]) and dots.photographs == ("q0", "q1", "q2")
     assert tuple(dots.colors[1]) == style.OUTLIER and tuple(dots.colors[2]) == style.ESTIMATE
     assert len(truth.points) == 1 and len(errors.points) == 1
     assert np.isfinite(dots.positions).all() and dots.radius_m > 0

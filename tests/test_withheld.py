@@ -58,7 +58,9 @@ class Reader:
         )
         self._before = set(client.gui._gui_input_handle_from_uuid) | set(self._parts(client))
         controls = AudienceControls(client.gui, 340, lambda event: None)
-        places = Places(lambda event: None, lambda chosen, extend: None, None, lambda label: None)
+        places = Places(
+            lambda event: None, lambda chosen, extend: None, None, lambda layer, name: None, lambda label: None
+        )
         self.display = RunDisplay(client, self.touches, controls, places, (380, 340))
         self.touch(SEEN)
         self._client = client

@@ -63,7 +63,7 @@ class Audience:
         self._page = LatestWorker(f"spherloc-page-{client.client_id}", self._draw)
         left_px, right_px = panel_widths_px(client.camera.image_width)
         controls = AudienceControls(client.gui, right_px, self._redraw)
-        places = Places(self._redraw, self._select, None, lambda label: None)
+        places = Places(self._redraw, self._select, None, lambda layer, name: None, lambda label: None)
         self._display = RunDisplay(client, self._touches, controls, places, (left_px, right_px))
         self._touches.on("select", self._select_numbers)
         self._touches.on("deselect", lambda touch: self._select(()))

@@ -78,6 +78,8 @@ class Places:
     """Matches were selected, by their numbers in the problem; or, if true, are to be added to what is."""
     move: Callable[[TrueCamera], None] | None
     """The true camera was dragged to a new place; None where it may not be."""
+    photograph: Callable[[str, str], None]
+    """The dot of a photograph was pressed: its layer, and the photograph's name."""
     scene_of: Callable[[str], MapScene | None]
     """The scene with images of that label, if it is one."""
 
@@ -100,7 +102,7 @@ class RunDisplay:
         )
         self.card = MatchCard(client.gui, movable, text_scale(client.camera.image_width))
         moved = places.move or (lambda place: None)
-        self.canvas = Canvas(client, self.controls.display, select, moved, sum(widths_px))
+        self.canvas = Canvas(client, self.controls.display, select, moved, places.photograph, sum(widths_px))
         self._widths_px = widths_px
         self._shown: tuple[Run, bytes | None, Picture] | None = None
         self._map: tuple[str, MapScene, bytes | None] | None = None

@@ -44,6 +44,7 @@ from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.app.web.viser_internals import at_once, follow_changes, guard_callbacks, is_linked, update_widget
 from spherloc_viz.app.workers import Job, LatestWorker
 from spherloc_viz.layers import steps
+from spherloc_viz.layers.matches import matches_with
 from spherloc_viz.layers.withheld import TOLD
 from spherloc_viz.lessons.numbers import number_text, numbers_of
 
@@ -107,7 +108,7 @@ class Session:
         """Whether all widgets are there: the first of them may be used before the last one is made."""
         left_px, right_px = panel_widths_px(client.camera.image_width)
         self._controls = Controls(client, self._catalog, services, self._touches, self, right_px)
-        places = Places(self.redraw, self.select, self._move_camera, self._catalog.map_scene)
+        places = Places(self.redraw, self.select, self._move_camera, self._press_photograph, self._catalog.map_scene)
         self._display = RunDisplay(client, self._touches, self._controls, places, (left_px, right_px))
         self._listen()
         self._built = True
@@ -237,6 +238,23 @@ class Session:
     def _move_camera(self, true_camera: TrueCamera) -> None:
         self._controls.scene.true_camera = true_camera
         self.changed()
+
+    def _press_photograph(self, layer: str, name: str) -> None:
+        """Open the query of a localized sequence whose dot was pressed; of a reference, select its matches."""
+        run = self._run
+        if run is None:
+            return
+        if layer == "trajectory":
+            self._controls.open_query(name)
+            return
+        scene = self._catalog.map_scene(run.request.scene.scene)
+        image = next((view.path for view in scene.references if view.name == name), None) if scene else None
+        found = matches_with(run.trace.problem, image)
+        if len(found):
+            self._display.panels.open_tab("Images")
+            self.select(found.tolist())
+        else:
+            self._status.say(f"{name} has no match with this query.")
 
     def shown(self) -> Shown | None:
         """What is on the page, to be exported."""

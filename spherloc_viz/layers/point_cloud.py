@@ -32,10 +32,12 @@ FEW_RAYS = 40
 
 def reference_dots(scene: MapScene, turn: FloatArray) -> Points:
     """Where a scene's references were taken; ``turn`` (3, 3) is the aligned frame from the map frame."""
-    posed = [view.cam_from_map for view in scene.references if view.cam_from_map is not None]
-    places = np.array([camera_centre(pose) for pose in posed]).reshape(-1, 3) @ turn.T
+    posed = [(view.name, view.cam_from_map) for view in scene.references if view.cam_from_map is not None]
+    names = tuple(name for name, _ in posed)
+    places = np.array([camera_centre(pose) for _, pose in posed]).reshape(-1, 3) @ turn.T
     size_m = float(np.max(np.ptp(places, axis=0), initial=0.0)) or 1.0
-    return Points(REFERENCES, LAYER, places, one_color(style.REFERENCE, len(places)), REFERENCE_DOT * size_m)
+    colors = one_color(style.REFERENCE, len(places))
+    return Points(REFERENCES, LAYER, places, colors, REFERENCE_DOT * size_m, photographs=names)
 
 
 def with_few_rays(picture: Picture, inliers: int) -> Picture:
@@ -60,10 +62,9 @@ def cloud_items(scene: MapScene, turn: FloatArray) -> tuple[SceneItem, ...]:
     points = scene.cloud[even(near, MAX_POINTS)] @ turn.T
     radius_m = DOT * float(np.max(np.ptp(points, axis=0)))
     dots = reference_dots(scene, turn)
-    names = [view.name for view in scene.references if view.cam_from_map is not None]
     labels = [
         Label(f"cloud/name-{k}", LAYER, place + np.array([0.0, 3.0 * dots.radius_m, 0.0]), name)
-        for k, (place, name) in enumerate(zip(dots.positions, names, strict=True))
+        for k, (place, name) in enumerate(zip(dots.positions, dots.photographs, strict=True))
     ]
     return (
         Points("cloud/points", LAYER, points, one_color(style.CLOUD, len(points)), radius_m),

@@ -45,6 +45,8 @@ class Points(Primitive):
     """Radius of every dot, metres."""
     ids: NDArray[np.int64] | None = None
     """(N,) index of the correspondence that each dot shows, if it shows one."""
+    photographs: tuple[str, ...] = ()
+    """(N,) name of the photograph that was taken at each dot, if the dots show that; else empty."""
     rim: bool = False
     """Whether only the rim of a dot is seen, around a smaller dot at the same position: a ring from every direction."""
 

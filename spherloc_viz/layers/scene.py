@@ -215,13 +215,16 @@ def trajectory_items(rows: Sequence[QueryResult], map_turn: FloatArray, limit_m:
     legs = np.stack([truth[:-1], truth[1:]], axis=1)[followed]
     both = known & located
     offsets = np.stack([truth, found], axis=1)[both]
-    ids = np.flatnonzero(shown)
+    taken = tuple(row.query for row, is_shown in zip(rows, shown, strict=True) if is_shown)
     steps = np.linalg.norm(np.diff(places[shown], axis=0), axis=1)
     dot_m = DOT_SHARE * float(np.median(steps)) if len(steps) else limit_m
     above = np.array([0.0, -3.0 * dot_m, 0.0])  # names of the map's images are below their dots
-    names = [Label(f"trajectory/name-{k}", "trajectory", places[k] + above, rows[k].query) for k in ids.tolist()]
+    names = [
+        Label(f"trajectory/name-{k}", "trajectory", place + above, name)
+        for k, place, name in zip(np.flatnonzero(shown).tolist(), places[shown], taken, strict=True)
+    ]
     return (
-        Points("trajectory/queries", "trajectory", places[shown], colors[shown], dot_m, ids),
+        Points("trajectory/queries", "trajectory", places[shown], colors[shown], dot_m, photographs=taken),
         Segments("trajectory/truth", "trajectory", legs, one_color(style.TRUTH, len(legs)), 2.0),
         Segments("trajectory/errors", "trajectory", offsets, colors[both], 2.0),
         *(names if len(names) <= MAX_NAMED else ()),

@@ -56,7 +56,7 @@ def with_selection(picture: Picture, trace: Trace, selected: tuple[int, ...]) ->
 
 def _dimmed(item: SceneItem, chosen: IntArray) -> SceneItem:
     """The item, with the colours of other correspondences moved towards grey."""
-    if not isinstance(item, Points | Segments | Balls) or item.layer == "trajectory":
+    if not isinstance(item, Points | Segments | Balls):
         return item
     if item.ids is not None:
         own = np.isin(item.ids, chosen).reshape(len(item.ids), -1)

@@ -176,6 +176,10 @@ def test_queries_their_photographs_and_the_whole_sequence(
     expect(tab.value("queries")).to_have_text("3 of 3")
     expect(tab.value("within 1° and 0.1 m")).to_have_text("3 of 3")
     tab.until(lambda: tab.instances("/trajectory/queries") == 3, "every query has its dot")
+    tab.settle()
+    ((x, y), *_) = tab.dots("/trajectory/queries")
+    tab.page.mouse.click(x, y)
+    expect(tab.widget("Query")).to_have_value("query_000")
     expect(tab.page.get_by_role("button", name="Localize all queries")).to_be_visible()
     recordings = images_address[1]
     names = {f"query_00{number}" for number in range(3)}

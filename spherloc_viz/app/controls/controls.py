@@ -250,7 +250,7 @@ class Controls:
         self._movable.on_update(self._owner.redraw)
         self._edits = gui.add_html("", visible=False)
         self.estimator = EstimatorControls(gui, self._owner.changed)
-        self.sequence = SequencePanel(gui, touches, self._chosen_sequence, self._localized, self._open_query)
+        self.sequence = SequencePanel(gui, touches, self._chosen_sequence, self._localized, self.open_query)
         self.display = DisplayControls(gui, self._owner.redraw)
 
     @property
@@ -376,7 +376,7 @@ class Controls:
         self._sequence = request
         return request.scene, scene, *self.estimator.read(), request.seed
 
-    def _open_query(self, name: str) -> None:
+    def open_query(self, name: str) -> None:
         """Go on with another query of the scene at hand."""
         request = self.scene.read_unchanged()
         self._owner.open(RunRequest(replace(request, query=name), *self.estimator.read()))

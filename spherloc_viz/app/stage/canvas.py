@@ -43,9 +43,11 @@ class Canvas:
         display: DisplayControls,
         picked: Callable[[tuple[int, ...], bool], None],
         moved: Callable[[tuple[float, float, float, float]], None],
+        photograph: Callable[[str, str], None],
         docked_px: int,
     ) -> None:
-        """``picked`` gets indices of correspondences in the problem, ``moved`` the true camera's new pose.
+        """``picked`` gets indices of correspondences in the problem, ``moved`` the true camera's new pose, and
+        ``photograph`` the layer and the name of a photograph whose dot was pressed.
 
         ``docked_px`` is the width of the panels beside the canvas.
         """
@@ -53,7 +55,7 @@ class Canvas:
         self._client, self._display = client, display
         self._text_scale, self._enlarged = text_scale(client.camera.image_width), 1.0
         self._label_scale = LABEL_SCALE * self._text_scale
-        self._painter = Painter(client, picked, self._label_scale)
+        self._painter = Painter(client, picked, photograph, self._label_scale)
         self._camera = TrueCamera(client, moved)
         self._full_width = client.camera.image_width
         self._docked_px = docked_px if self._full_width >= NARROW_PX else 0

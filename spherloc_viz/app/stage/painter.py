@@ -15,7 +15,7 @@ from PIL import Image
 
 from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
-from spherloc_viz.app.stage.picking import inside, nearest, viewer_of
+from spherloc_viz.app.stage.picking import inside, nearest, photograph, viewer_of
 from spherloc_viz.app.web.viser_internals import update_node
 from spherloc_viz.layers.frame import icosphere, one_color
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, SceneItem, Segments, Textured
@@ -86,6 +86,8 @@ def _unlit(tree: dict[str, Any]) -> None:
 
 OnPick = Callable[[tuple[int, ...], bool], None]
 """Called with the picked correspondences (indices in the problem) and whether they are added to the selection."""
+OnPhotograph = Callable[[str, str], None]
+"""Called with the layer and the name of a photograph whose dot was pressed."""
 
 SHELLS = 12
 """Number of nodes into which the balls of one primitive are divided."""
@@ -114,11 +116,13 @@ class Painter:
         self,
         client: viser.ClientHandle | viser.ViserServer,
         on_pick: OnPick | None = None,
+        on_photograph: OnPhotograph = lambda layer, name: None,
         label_scale: float = LABEL_SCALE,
     ) -> None:
         """``label_scale`` is the size of labels, relative to viser's own.
 
-        ``on_pick`` is called on viser's threads, with () for a click on nothing; None is for a still page."""
+        ``on_pick`` and ``on_photograph`` are called on viser's threads, the former with () for a click on nothing;
+        None is for a still page."""
         self._client, self._label_scale = client, label_scale
         self._drawn: dict[str, tuple[Any, tuple, SceneItem]] = {}
         self._textured: dict[str, tuple[Hashable, bytes | None]] = {}
@@ -137,8 +141,8 @@ class Painter:
         self._backdrop: tuple[bytes, Any] | None = None
         self._backdrop_wanted = False
         if on_pick is not None:
-            scene, extend = client.scene, partial(self._clicked, on_pick, True)
-            scene.on_click()(partial(self._clicked, on_pick, False))
+            scene, extend = client.scene, partial(self._clicked, on_pick, on_photograph, True)
+            scene.on_click()(partial(self._clicked, on_pick, on_photograph, False))
             scene.on_click(modifier="shift")(extend)
             scene.on_click(modifier="cmd/ctrl")(extend)
             scene.on_rect_select(modifier="shift")(partial(self._framed, on_pick))
@@ -250,11 +254,17 @@ class Painter:
             self._textured[item.name] = known = (item.key, glb)
         return known[1]
 
-    def _clicked(self, on_pick: OnPick, extend: bool, event: viser.SceneClickEvent) -> None:
+    def _clicked(
+        self, on_pick: OnPick, on_photograph: OnPhotograph, extend: bool, event: viser.SceneClickEvent
+    ) -> None:
         self.clicked_x = float(event.screen_pos[0])
         viewer = viewer_of(event.client.camera)
-        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-        on_pick(nearest(self._shown, origin, direction, viewer.radians_per_pixel), extend)
+        ray = np.array(event.ray_origin), np.array(event.ray_direction), viewer.radians_per_pixel
+        taken = photograph(self._shown, *ray)
+        if taken is None:
+            on_pick(nearest(self._shown, *ray), extend)
+        else:
+            on_photograph(*taken)
 
     def _framed(self, on_pick: OnPick, event: viser.SceneRectSelectEvent) -> None:
         on_pick(inside(self._shown, viewer_of(event.client.camera), event.screen_min, event.screen_max), False)

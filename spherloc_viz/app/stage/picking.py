@@ -16,8 +16,6 @@ LINE_PX = 5.0
 """Largest distance of a click from a line that it picks."""
 NEAR = 1e-6
 """Depths below this, m, count as behind the viewer."""
-OTHERS = "trajectory"
-"""Layer whose ids are those of queries and not of correspondences."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +53,12 @@ def inside(
 ) -> tuple[int, ...]:
     """Correspondences with a dot inside the rectangle between two places on the canvas, hidden or not."""
     found: set[int] = set()
-    for item in _dots(items):
+    for item in items:
+        if not isinstance(item, Points) or item.ids is None:
+            continue
         places = viewer.project(item.positions)
         with np.errstate(invalid="ignore"):
             within = ((places >= low) & (places <= high)).all(axis=1)
-        assert item.ids is not None
         found.update(item.ids[within].tolist())
     return tuple(sorted(found))
 
@@ -72,20 +71,27 @@ def nearest(
     Of several balls the smallest is picked, since the larger ones around it can be clicked beside it. () for nothing.
     """
     items, forward = tuple(items), direction / np.linalg.norm(direction)
-    return (
-        _dot(items, origin, forward, DOT_PX * radians_per_pixel)
-        or _line(items, origin, forward, LINE_PX * radians_per_pixel)
-        or _ball(items, origin, forward)
-    )
+    dots = [item for item in items if isinstance(item, Points) and item.ids is not None]
+    dot = _dot(dots, origin, forward, DOT_PX * radians_per_pixel)
+    if dot is not None and dot[0].ids is not None:
+        return (int(dot[0].ids[dot[1]]),)
+    return _line(items, origin, forward, LINE_PX * radians_per_pixel) or _ball(items, origin, forward)
 
 
-def _dots(items: Iterable[SceneItem]) -> list[Points]:
-    return [item for item in items if isinstance(item, Points) and item.ids is not None and item.layer != OTHERS]
+def photograph(
+    items: Iterable[SceneItem], origin: FloatArray, direction: FloatArray, radians_per_pixel: float
+) -> tuple[str, str] | None:
+    """The photograph on whose dot a ray from the viewer picks, as the layer of the dot and its name; None for another
+    dot, or none."""
+    dots = [item for item in items if isinstance(item, Points) and (item.ids is not None or item.photographs)]
+    found = _dot(dots, origin, direction / np.linalg.norm(direction), DOT_PX * radians_per_pixel)
+    return (found[0].layer, found[0].photographs[found[1]]) if found is not None and found[0].photographs else None
 
 
-def _dot(items: Iterable[SceneItem], origin: FloatArray, forward: FloatArray, reach: float) -> tuple[int, ...]:
-    best, found = (reach, np.inf), ()
-    for item in _dots(items):
+def _dot(dots: Iterable[Points], origin: FloatArray, forward: FloatArray, reach: float) -> tuple[Points, int] | None:
+    """The nearest dot to a ray, as an item and a number in it."""
+    best, found = (reach, np.inf), None
+    for item in dots:
         depth, away = _along(item.positions - origin, forward)
         with np.errstate(divide="ignore", invalid="ignore"):
             miss = np.where(depth > NEAR, np.maximum(away - item.radius_m, 0.0) / depth, np.inf)
@@ -94,8 +100,7 @@ def _dot(items: Iterable[SceneItem], origin: FloatArray, forward: FloatArray, re
         at = int(np.lexsort((depth, miss))[0])
         score = (float(miss[at]), float(depth[at]))
         if score < best:
-            assert item.ids is not None
-            best, found = score, (int(item.ids[at]),)
+            best, found = score, (item, at)
     return found
 
 
