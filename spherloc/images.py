@@ -57,8 +57,16 @@ def check_image(path: Path) -> tuple[int, int]:
     Raises ``InputError`` as ``read_image`` does; ``read_size`` does not notice that the end of a file is missing.
     """
     size = read_size(path)
-    _decode(path, cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION)
+    read_eighth(path)
     return size
+
+
+def read_eighth(path: Path) -> ByteArray:
+    """An image as grey bytes (H / 8, W / 8): a JPEG in a tenth of the usual time.
+
+    Raises ``InputError`` as ``read_image`` does.
+    """
+    return _decode(path, cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def grey(image: ByteArray) -> ByteArray:

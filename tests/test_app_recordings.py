@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from spherloc.datasets.variation import Variation
-from spherloc.errors import RecordingError
+from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import default_options, estimate
 from spherloc.trace import Trace
 from spherloc_viz.app import session as session_module
@@ -40,6 +40,8 @@ def test_recorded_problems_do_not_pile_up(tmp_path: Path) -> None:
     assert len(page.scenes) == before + MAX_BRIEF and len(catalog.scenes) == before
     assert all(label in page.scenes for label in labels[-MAX_BRIEF:]) and page.path(labels[-1]).name == "19.rrd"
     assert page.enter(scene, tmp_path / "19.rrd", "tiny (recorded)", brief=True) == labels[-1]
+    with pytest.raises(InputError, match=r"is not offered any more, as 8 recordings were opened since"):  # as by Undo
+        page.problem(SceneRequest(labels[0], 0))
 
 
 @pytest.fixture

@@ -3,9 +3,11 @@
 import copy
 import re
 import tomllib
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import astuple, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from spherloc.errors import InputError
 from spherloc.metrics import evaluate
 from spherloc_viz.commands.cli import app
 from spherloc_viz.gallery import GALLERY, gallery_cases
-from spherloc_viz.gallery.case import Played, agrees, faults, loose_numbers, play
+from spherloc_viz.gallery.case import GalleryCase, Play, Played, agrees, faults, play
 from spherloc_viz.gallery.file import parse_gallery
 from spherloc_viz.gallery.regenerate import chosen, outcome, record, stories
 from spherloc_viz.recording.content.data import read_recording
@@ -56,6 +58,33 @@ def played(key: str) -> Played:
     if key in SLOW_BESIDE:
         case = replace(case, beside=tuple(item for item in case.beside if item.estimator not in BASELINES))
     return play(case)
+
+
+CITATION = re.compile(r"Fig\. \d+[a-z]?( and \d+[a-z])?|Table VI|experiment \d+|Eq\. \d+( and \d+)?|\b2P(\d+k)?\b")
+NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?")
+
+
+def loose_numbers(case: GalleryCase) -> tuple[str, ...]:
+    """Numbers of the story that are neither facts nor settings nor quoted, and facts that it does not mention."""
+    plays = (case, *case.beside)
+    facts = {float(value) for item in plays for value in item.facts.values()}
+    known = facts | {float(value) for value in case.quoted} | {float(value) for value in settings_of(plays)}
+    told = {float(text.replace(",", "")): text for text in NUMBER.findall(CITATION.sub("", case.story))}
+    return tuple(
+        [f"{text} is told, but is not a fact" for value, text in told.items() if value not in known]
+        + [f"{value:g} is a fact, but is not told" for value in sorted(facts - told.keys()) if value]
+    )
+
+
+def settings_of(plays: tuple[Play, ...]) -> Iterator[float]:
+    """The settings of runs, shares in percent too."""
+    for item in plays:
+        groups = () if item.staged is None else item.staged.groups
+        staged = () if item.staged is None else (item.staged.gravity_bound_deg, item.staged.focal_off)
+        values: list[Any] = [item.seed, *staged, *astuple(item.options), *item.variation.simulation.values()]
+        for value in [*values, *(group.count for group in groups)]:
+            if isinstance(value, int | float):
+                yield from (value, round(100 * value, 6))
 
 
 @pytest.mark.parametrize("key", KEYS)

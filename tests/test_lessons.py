@@ -9,7 +9,7 @@ from spherloc_viz import style
 from spherloc_viz.app.lesson_file import LinkedRuns, images_of, images_picture
 from spherloc_viz.layers import steps
 from spherloc_viz.lessons import lesson_named, lessons
-from spherloc_viz.lessons.html import FORMULA, IMAGES, changes_in, lesson_page, list_page, names_in, prose_html
+from spherloc_viz.lessons.html import FIELD, FORMULA, IMAGES, lesson_page, links_in, list_page, names_in, prose_html
 from spherloc_viz.lessons.lesson import MANY, changed_state, parse_lesson, state_parts
 from spherloc_viz.lessons.numbers import numbers_of
 from tests.lesson_claims import holds, split_claim
@@ -44,6 +44,23 @@ def texts(moment):
     if moment.question is not None:
         said += [moment.question.ask, *(part for one in moment.question.answers for part in (one.text, one.shows))]
     return said
+
+
+def changes_in(text: str) -> tuple[str, ...]:
+    """The changes of the state that a text offers: its links, and both ends of its sliders."""
+    found = list(links_in(text))
+    for words in FIELD.findall(text):
+        kind, *rest = words.split(" ", 2)
+        if kind == "slider":
+            first, last, *_ = rest[1].split()
+            found += [change_of(rest[0], first), change_of(rest[0], last)]
+        elif kind == "choice":
+            found += [change_of(rest[0], word) for word in rest[1].split("|")]
+    return tuple(found)
+
+
+def change_of(key: str, value: str) -> str:
+    return changed_state("", f"{key.replace('.', '=', 1)}%3D{value}" if "." in key else f"{key}={value}")
 
 
 def moments():

@@ -1,4 +1,4 @@
-"""The house keeps its walls and floors (docs: the four walls; one reads the code from the ground to the roof).
+"""The house keeps its walls and floors (docs/architecture.md; one reads the code from the ground to the roof).
 
 1. ``spherloc`` knows no screen: no viewer, server or command line library, and no ``spherloc_viz``.
 2. A file imports only from floors below its own, or from its own floor where that makes no circle.

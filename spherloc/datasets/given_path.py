@@ -16,7 +16,7 @@ COMMAND = re.compile(r": spherloc [^;]*$")
 """A command at the end of a sentence."""
 MAX_SCENE_BYTES = 1_000_000
 """Largest TOML file that is looked at."""
-_MAX_FOLDERS = 50
+MAX_FOLDERS = 50
 """Largest number of subfolders that are searched for images."""
 
 _COLMAP = "a scene of kind colmap localizes its images: spherloc scenes colmap prints one to start from"
@@ -90,7 +90,7 @@ def _folder(path: Path) -> tuple[str, str]:
         return _counted(images, "image"), "a map takes two images or more: add some to it"
     if images:
         return _counted(images, "image"), f"make a map of it with: spherloc map {_quoted(path)}"
-    inside = images_in_folders(path, names)
+    inside = images_in_folders(path, names, MAX_FOLDERS)
     if inside:
         what = f"a folder without images, but with {sum(inside.values()):,} in the folders in it"
         return what, f"make a map of them with: spherloc map {_quoted(path)}"
@@ -118,10 +118,10 @@ def _images(names: Sequence[str]) -> int:
     return sum(is_image(name) for name in names)
 
 
-def images_in_folders(path: Path, names: Sequence[str]) -> dict[str, int]:
-    """Number of images in each subfolder that has some, by its name."""
+def images_in_folders(path: Path, names: Sequence[str], most: int | None = None) -> dict[str, int]:
+    """Number of images in each subfolder that has some, by its name; of at most ``most`` folders if that is given."""
     counts = {}
-    for name in [name for name in names if is_folder(path / name)][:_MAX_FOLDERS]:
+    for name in [name for name in names if is_folder(path / name)][:most]:
         try:
             counts[name] = _images(names_in(path / name))
         except InputError:

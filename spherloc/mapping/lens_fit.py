@@ -174,11 +174,12 @@ def fit_lens(
         return float(np.abs(other.lens.angles(radii) - whole.lens.angles(radii)).max())
 
     alike = []
-    for other in others:
-        if other.score > NEARLY * best.score:
-            other = _refined(pycolmap, few, other.lens, expected, BOUNDS_PX)
-            same = _refined(pycolmap, few, whole.lens, expected, BOUNDS_PX[-1:])
-            alike += [other] if other.score > NEARLY * same.score else []
+    rivals = [other for other in others if other.score > NEARLY * best.score]
+    same = _refined(pycolmap, few, whole.lens, expected, BOUNDS_PX[-1:]) if rivals else whole
+    for rival in rivals:
+        with suppress(ValueError):  # fits nothing within the last bounds
+            fit = _refined(pycolmap, few, rival.lens, expected, BOUNDS_PX)
+            alike += [fit] if fit.score > NEARLY * same.score else []
     for half, shift in ((every[0::2], SHIFT_K1), (every[1::2], -SHIFT_K1)):
         alike.append(_refined(pycolmap, half, whole.lens, replace(expected, k1=shift), BOUNDS_PX))
     tell(STAGE, FITS, FITS)

@@ -91,8 +91,9 @@ def make_map(
     For ``new_images``, a scene is written too; ``masks`` are the masks of the views, which are written into the scenes,
     and ``how`` says which features are matched. With ``find_carried``, what moves with the camera below panoramas is
     found and left out, too; ``stated`` is gravity that a file states. Raises ``InputError`` if the images give no map,
-    if ``measured`` names other images, or if a file cannot be read: then nothing is left in ``folder`` but what was
-    there before. Raises ``StoppedError`` if a file cannot be written: what is done is kept there and not done again.
+    if ``measured`` names other images, or if a file cannot be read: then nothing is left in ``folder`` but a map that
+    was finished before. Raises ``StoppedError`` if a file cannot be written: what is done is kept there and not done
+    again.
     """
     names = {view.name for view in views}
     for name in () if measured.distance is None else measured.distance[:2]:
@@ -175,7 +176,9 @@ def _map_in(
             place.mkdir(exist_ok=True)
         except OSError as error:
             raise InputError(f"{place}: cannot be made ({error.strerror}); {advice('other folder')}.") from None
-        groups.append(Map(*found, write_map(*found, views, images, place, new_images, kept), lines))
+        group, level, scale = found
+        own = write_map(*found, views, images, place, new_images, kept)
+        groups.append(replace(made, made=group, level=level, scale=scale, written=own))
     return replace(made, groups=tuple(groups))
 
 

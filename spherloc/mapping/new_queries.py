@@ -1,7 +1,8 @@
 """Other images in a map that is made already: writes a scene whose queries they are, beside that of the map."""
 
 from collections.abc import Mapping
-from pathlib import Path
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from spherloc.datasets.scene_file import read_table, section
@@ -68,14 +69,23 @@ def _name(table: Mapping[str, Any]) -> str:
 
 
 def _mapped(model_folder: Path, images: Path) -> Photographs:
-    """The images of the map with their cameras; where it has several, as the folder of the images tells them."""
+    """The images of the map with their cameras; where it has several, by the folders of their images, else as the
+    calibrations beside these name them, else by COLMAP's numbers."""
     model = read_model(model_folder)
     views = tuple(View(one.name, model.camera(one.camera_id), images / one.name) for one in model.images.values())
     if len(cameras_of(views)) == 1:
         return Photographs(views, (), {})
-    told = with_cameras(images, {})
-    # Cameras that the photographs told are by their folders.
-    return told if told.views else Photographs(views, (), {Path(view.name).parts[0]: view.camera for view in views})
+    folders: dict[str, list[View]] = {}
+    for view in views:
+        folders.setdefault(PurePosixPath(view.name).parent.as_posix(), []).append(view)
+    if "." not in folders and all(len(cameras_of(some)) == 1 for some in folders.values()):
+        return Photographs(views, (), {name: some[0].camera for name, some in folders.items()})
+    with suppress(InputError):  # of cameras that were given when the map was made, nothing lies beside the images
+        told = with_cameras(images, {})
+        if len(cameras_of(told.views)) == len(cameras_of(views)):
+            return told
+    numbers = sorted({one.camera_id for one in model.images.values()})
+    return Photographs(views, (), {f"camera {number}": model.camera(number) for number in numbers})
 
 
 def _section(table: Mapping[str, Any], name: str, where: str) -> list[str]:

@@ -14,11 +14,12 @@ from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.given_path import SCENE, images_in_folders, what_it_is
 from spherloc.errors import InputError, SpherlocError, shorten
-from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in
+from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in, write_whole
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
-from spherloc.images import check_image, grey, read_image, read_size
+from spherloc.images import check_image, grey, read_eighth, read_image, read_size
 from spherloc.mapping.advice import advice
+from spherloc.mapping.image_circle import BLACK
 from spherloc.mapping.lens import for_colmap
 from spherloc.types import ByteArray
 
@@ -27,6 +28,8 @@ MAX_IMAGES = 500
 """Largest number of images of a map: the features of each take 4 MB."""
 MIN_PANORAMA_PX = 200
 """Least length of the longer side of a panorama."""
+MIN_REDUCED_PX = 1024
+"""Least height of an image that is seen well enough at an eighth of its size."""
 UNREAD = {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gpr", ".heic", ".heif", ".insp", ".nef", ".orf", ".raf", ".rw2"}
 """Endings of photographs that OpenCV does not read."""
 MAX_NAMED = 3
@@ -34,8 +37,6 @@ MAX_NAMED = 3
 CALIBRATIONS = (".yaml", ".yml", ".json", ".toml", ".txt")
 MAX_CALIBRATIONS = 20
 """Largest number of files beside the photographs that are tried as a calibration."""
-BLACK = 16
-"""Largest grey value of what no light has reached, after JPEG compression."""
 SHARPNESS_PX = 512
 """Frames are scaled to this longer side before their sharpness is compared."""
 
@@ -229,7 +230,7 @@ def _of_folder(
     for size, names in sizes.items():
         found, about = _with_cameras(names, size, cameras)
         if not given and not found and size[0] == 2 * size[1] >= MIN_PANORAMA_PX:
-            raw = [name for name in names if not panorama and two_circles(read_image(folder / name))]
+            raw = [name for name in names if not panorama and _is_raw(folder / name, size[1])]
             found = {name: Equirectangular(*size) for name in names if name not in raw}
             remarks += _about_raw(raw)
         camera_of |= found
@@ -379,6 +380,11 @@ def _some(names: Sequence[str]) -> str:
     return f"{', '.join(shorten(name) for name in names[:MAX_NAMED])}{', …' if len(names) > MAX_NAMED else ''}"
 
 
+def _is_raw(path: Path, height: int) -> bool:
+    """Whether an image of that height, px, shows two circles (``two_circles``)."""
+    return two_circles(read_eighth(path) if height >= MIN_REDUCED_PX else read_image(path))
+
+
 def two_circles(image: ByteArray) -> bool:
     """Whether an image (H, W) or (H, W, 3) of 2 to 1 shows the raw circles of two fisheyes: both halves are black in
     their corners and not in the rows between. A panorama has its zenith along the whole upper edge, and its nadir along
@@ -419,7 +425,7 @@ def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], No
         if not is_file(path):
             done, content = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
             try:
-                path.write_bytes(content.tobytes() if done else b"")
+                write_whole(path, content.tobytes() if done else b"")
             except OSError as error:
                 raise InputError(f"{path}: cannot be written ({error.strerror}); give another folder.") from None
         written += 1

@@ -81,7 +81,7 @@ def read_positions(path: Path, views: Sequence[View]) -> Positions:
     words = _words(first[1])
     if path.suffix.lower() == ".csv" and (len(words) > 8 or words[0].isdigit()):
         found = _at_times(read_euroc(path), views)
-    elif len(words) == 8 and words[0].replace(".", "", 1).isdigit():
+    elif len(words) == 8 and _is_number(words[0]):
         found = _of_trajectory(path, views)
     else:
         return _of_rows(path, views)
@@ -120,6 +120,14 @@ def _time_ns(name: str) -> int | None:
     if match is None:
         return None
     return int(match[1]) if match.re is _DEVICE_NS else int(Decimal(match[1]) * NS_PER_S)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _words(text: str) -> list[str]:

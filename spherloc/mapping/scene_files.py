@@ -18,6 +18,8 @@ MODEL = "model"
 """Folder of COLMAP's model in that of the map."""
 SCENE = "scene.toml"
 """Scene file of the map's own images."""
+MAP_FOLDER = "{}_map"
+"""What the folder of a map is called, by that of its photographs."""
 LENS = "lens.toml"
 """Calibration file of a lens that the map's images told."""
 COMMENT_WIDTH = 110
@@ -131,9 +133,10 @@ def write_new_scene(head: MapHead, folder: Path, new_images: NewImages, camera: 
 
 
 def _file_name(new_images: Path) -> str:
-    """What the scene file of new images is called: as their folder, so that several folders have one each."""
+    """What the scene file of new images is called: as their folder, so that several folders have one each, but not as
+    the map's own scene or a lens."""
     name = new_images.resolve().name
-    return f"new_{name}" if f"{name}.toml" == SCENE else name
+    return f"new_{name}" if f"{name}.toml" in (SCENE, LENS) or name.startswith("lens_") else name
 
 
 def relative(path: Path, folder: Path) -> str:

@@ -75,12 +75,12 @@ class Catalog:
     def add(self, scene: Scene, path: Path, label: str | None = None) -> str:
         """Add a scene, or load it anew if its file is known already; returns its label, by default its name.
 
-        The label is made longer if another scene has it already.
+        The label is made longer if another scene has, or had, it already.
         """
         path, label = path.resolve(), label or scene.name
         known = next((known for known, file in self._paths.items() if file == path), None)
         names = chain([label, f"{label} ({path.name})"], (f"{label} {number}" for number in count(2)))
-        free = known or next(name for name in names if name not in self.scenes)
+        free = known or next(name for name in names if name not in self._paths)
         self.scenes[free], self._paths[free] = scene, path
         return free
 
@@ -90,7 +90,7 @@ class Catalog:
         if brief:
             self._brief = [*(other for other in self._brief if other != entered), entered]
             for old in self._brief[:-MAX_BRIEF]:
-                del self.scenes[old], self._paths[old]
+                del self.scenes[old]  # its label stays taken: requests of the history have it
             self._brief = self._brief[-MAX_BRIEF:]
         return entered
 
@@ -117,7 +117,7 @@ class Catalog:
 
         Its pictures may not be drawn yet.
         """
-        return self._caches.problem(self.scenes[request.scene], request.seed, request.query, request.variation)
+        return self._caches.problem(self._scene(request.scene), request.seed, request.query, request.variation)
 
     def mesh(self, label: str) -> bytes | None:
         """Binary glTF (cached) of a scene's map, in the map frame; None if it has none. May take a second or two."""
@@ -131,13 +131,21 @@ class Catalog:
 
     def synthetic(self, label: str) -> SyntheticScene | None:
         """The scene of that label if it is a random one, whose parameters can be changed."""
-        scene = self.scenes[label]
+        scene = self._scene(label)
         return scene if isinstance(scene, SyntheticScene) else None
 
     def map_scene(self, label: str) -> MapScene | None:
         """The scene of that label if it is made of images, which are localized one by one."""
-        scene = self.scenes[label]
+        scene = self._scene(label)
         return scene if isinstance(scene, MapScene) else None
+
+    def _scene(self, label: str) -> Scene:
+        """The scene of that label; raises ``InputError`` for a recorded problem that newer ones have replaced."""
+        if label not in self.scenes:
+            raise InputError(
+                f"{label}: is not offered any more, as {MAX_BRIEF} recordings were opened since; open its recording."
+            )
+        return self.scenes[label]
 
 
 class _Caches:

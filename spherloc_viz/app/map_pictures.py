@@ -1,5 +1,6 @@
 """Makes the slow parts of a page after its run is shown: the mesh of the map, and the pictures of a rendered scene."""
 
+import threading
 from collections.abc import Callable
 
 from spherloc.files import is_file
@@ -20,6 +21,7 @@ class MapPictures:
     ) -> None:
         """``redraw`` is called whenever there is more to be seen, and ``guarded`` turns errors into words."""
         self._catalog, self._say, self._redraw = catalog, say, redraw
+        self._lock = threading.Lock()
         self._run: Run | None = None
         self._whole: Run | None = None
         self._worker = LatestWorker(f"spherloc-pictures-{number}", guarded(self._work))
@@ -35,10 +37,11 @@ class MapPictures:
 
     def want(self, run: Run) -> None:
         """Make what this run shows."""
-        self._run = run
-        if self._catalog.map_scene(run.request.scene.scene) is None:
-            self._whole = run
-        else:
+        drawn = self._catalog.map_scene(run.request.scene.scene) is None
+        with self._lock:
+            self._run = run
+            self._whole = run if drawn else self._whole
+        if not drawn:
             self._worker.ask()
 
     def whole(self, run: Run) -> bool:
@@ -52,7 +55,8 @@ class MapPictures:
         try:
             self._make(run)
         finally:
-            self._whole = run
+            with self._lock:  # another run may be wanted by now, and be whole
+                self._whole = run if self._run is run else self._whole
             self._redraw()
 
     def _make(self, run: Run) -> None:

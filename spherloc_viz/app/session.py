@@ -64,9 +64,8 @@ T = TypeVar("T")
 class Session:
     """Lives as long as the tab's connection.
 
-    Threads of its own, so that steps can be walked while the next run is being solved: one solves the newest request,
-    one shows the newest run, one diagnoses it, one looks after slow runs. All leave the interpreter while they compute
-    or wait.
+    Threads of its own, so that steps can be walked while the next run is being solved (docs/architecture.md lists
+    them). All leave the interpreter while they compute or wait.
     """
 
     def __init__(self, client: viser.ClientHandle, services: Services) -> None:

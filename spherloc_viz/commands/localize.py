@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
+from itertools import chain, count
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -447,11 +448,14 @@ def write_comparison(folder: Path, found: Sequence[Compared]) -> str:
         TABLE: "".join(csv_line(line) for line in (table.columns, *table.rows)).encode(),
         MARKDOWN: markdown(table).encode(),
     }
-    names = list(dict.fromkeys(item.results.configuration.name for item in found))
-    for name in names:
-        of_scene = [item for item in found if item.results.configuration.name == name]
+    scenes: dict[str, list[Compared]] = {}  # by the path: two can have one name
+    for item in found:
+        scenes.setdefault(item.results.configuration.scene, []).append(item)
+    for of_scene in scenes.values():
+        name = re.sub(r"[^A-Za-z0-9-]+", "_", of_scene[0].results.configuration.name).strip("_") or "scene"
+        numbered = chain([f"{name}.png"], (f"{name}_{number}.png" for number in count(2)))
         picture = trajectories_png([(item.label, item.results) for item in of_scene], of_scene[0].backdrop)
-        files[f"{re.sub(r'[^A-Za-z0-9-]+', '_', name).strip('_') or 'scene'}.png"] = picture
+        files[next(file for file in numbered if file not in files)] = picture
     for name, content in files.items():
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -482,10 +486,10 @@ def _row(item: Compared) -> tuple[str, ...]:
         str(told.failed),
         " / ".join(NONE if rate.rate is None else f"{100 * rate.rate:.1f}" for rate in rates) or NONE,
         " / ".join(_limit(rate, item.results.configuration.unit) for rate in rates) or NONE,
-        _quantity(told.median_rotation_error_deg, 1.0, "deg"),
+        _quantity(told.median_rotation_error_deg, "deg"),
         _length(told.median_translation_error_m, item.results.configuration),
         " / ".join(NONE if score is None else f"{100 * score:.1f}" for score in scores),
-        _quantity(told.median_estimating_ms, 1.0, "ms"),
+        _quantity(told.median_estimating_ms, "ms"),
     )
 
 
@@ -497,8 +501,8 @@ def _length(value: float | None, setting: Configuration) -> str:
     return NONE if value is None else setting.length(value)
 
 
-def _quantity(value: float | None, factor: float, unit: str) -> str:
-    return NONE if value is None else f"{factor * value:.3g} {unit}"
+def _quantity(value: float | None, unit: str) -> str:
+    return NONE if value is None else f"{value:.3g} {unit}"
 
 
 def markdown(table: Table) -> str:

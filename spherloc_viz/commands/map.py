@@ -41,7 +41,7 @@ from spherloc.mapping.photographs import (
     photographs,
 )
 from spherloc.mapping.positions import read_positions
-from spherloc.mapping.scene_files import LENS, kept_lens, lens_path, write_lenses
+from spherloc.mapping.scene_files import LENS, MAP_FOLDER, kept_lens, lens_path, write_lenses
 from spherloc.mapping.stated_gravity import read_stated_gravity
 from spherloc.mapping.upright import Tell
 from spherloc.registry import require
@@ -83,7 +83,7 @@ def make(
     """
     end_without_a_trace()
     how = how_of(features)
-    target = output or Path(f"{folder.resolve().name}_map")
+    target = output or Path(MAP_FOLDER.format(folder.resolve().name))
     with _stages() as tell, _compiled_for(new_images):
         if video is not None:
             _take_frames(*video, folder, tell)

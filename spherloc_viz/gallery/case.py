@@ -1,8 +1,7 @@
 """What a case of the gallery is: a run that is described wholly, the story it tells, and what shows that it is true."""
 
-import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import astuple, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import comb
 from pathlib import Path
@@ -250,8 +249,6 @@ def origin_of(play: Play, title: str, story: str) -> Origin:
 PICTURES_SLACK = 0.15
 """Share by which facts of a run on pictures may be off: other processors round otherwise when pictures are drawn and
 described, so that some matches come and go."""
-_CITATION = re.compile(r"Fig\. \d+[a-z]?( and \d+[a-z])?|Table VI|experiment \d+|Eq\. \d+( and \d+)?|\b2P(\d+k)?\b")
-_NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,26 +318,3 @@ def agrees(told: float, measured: float, slack: float = 0.0) -> bool:
         return bool(abs(told - np.round(measured)) <= np.ceil(slack * (abs(told) + 1)))
     decimals = len(repr(told).partition(".")[2])
     return bool(abs(told - measured) <= 10.0**-decimals + slack * abs(told))
-
-
-def loose_numbers(case: GalleryCase) -> tuple[str, ...]:
-    """Numbers of the story that are neither facts nor settings nor quoted, and facts that it does not mention."""
-    plays = (case, *case.beside)
-    facts = {float(value) for item in plays for value in item.facts.values()}
-    known = facts | {float(value) for value in case.quoted} | {float(value) for value in _numbers(plays)}
-    told = {float(text.replace(",", "")): text for text in _NUMBER.findall(_CITATION.sub("", case.story))}
-    return tuple(
-        [f"{text} is told, but is not a fact" for value, text in told.items() if value not in known]
-        + [f"{value:g} is a fact, but is not told" for value in sorted(facts - told.keys()) if value]
-    )
-
-
-def _numbers(plays: tuple[Play, ...]) -> Iterator[float]:
-    """The settings of runs, shares in percent too."""
-    for item in plays:
-        groups = () if item.staged is None else item.staged.groups
-        staged = () if item.staged is None else (item.staged.gravity_bound_deg, item.staged.focal_off)
-        values: list[Any] = [item.seed, *staged, *astuple(item.options), *item.variation.simulation.values()]
-        for value in [*values, *(group.count for group in groups)]:
-            if isinstance(value, int | float):
-                yield from (value, round(100 * value, 6))

@@ -124,23 +124,6 @@ def links_in(text: str) -> tuple[str, ...]:
     return tuple(unescape(changes) for changes in LINK.findall(_markdown().render(text)))
 
 
-def changes_in(text: str) -> tuple[str, ...]:
-    """The changes of the state that a text offers: its links, and both ends of its sliders."""
-    found = list(links_in(text))
-    for words in FIELD.findall(text):
-        kind, *rest = words.split(" ", 2)
-        if kind == "slider":
-            first, last, *_ = rest[1].split()
-            found += [_change(rest[0], first), _change(rest[0], last)]
-        elif kind == "choice":
-            found += [_change(rest[0], word) for word in rest[1].split("|")]
-    return tuple(found)
-
-
-def _change(key: str, value: str) -> str:
-    return changed_state("", f"{key.replace('.', '=', 1)}%3D{value}" if "." in key else f"{key}={value}")
-
-
 def _whole(word: re.Match[str]) -> str:
     return f'<span class="whole">{word[0]}</span>'
 

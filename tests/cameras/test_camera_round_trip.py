@@ -22,6 +22,10 @@ def test_every_camera_keeps_the_contract(name):
     assert list(camera.to_dict())[:3] == ["model", "width", "height"]
 
 
+def test_every_model_has_a_sample():
+    assert {camera.model for camera in INLINE.values()} == set(registry.names("cameras"))
+
+
 @pytest.mark.parametrize("name", INLINE)
 def test_the_optical_axis_is_exact(name):
     camera = INLINE[name]

@@ -316,6 +316,11 @@ def test_several_estimators_and_scenes_in_one_table(tmp_path: Path, capsys: pyte
         np.testing.assert_array_equal(a.cam_from_map, b.cam_from_map)
     compare_sequences(scenes, 0, (), False, out)
     assert "4 of 4 queries are done already" in capsys.readouterr().err
+    for path in scenes:
+        path.write_text(path.read_text().replace("walk by night", "walk by day"))
+    alike = {path: [Solving("mc", (), tmp_path / path.parent.name, None)] for path in scenes}
+    compare_sequences(alike, 0, (), False, tmp_path / "alike")
+    assert {path.name for path in (tmp_path / "alike").glob("*.png")} == {"walk_by_day.png", "walk_by_day_2.png"}
 
 
 @pytest.mark.usefixtures("drawn")

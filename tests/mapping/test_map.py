@@ -39,7 +39,7 @@ from spherloc.mapping.photographs import (
     photographs,
     two_circles,
 )
-from spherloc.mapping.scene_files import _camera, _queries
+from spherloc.mapping.scene_files import MODEL, MapHead, _camera, _queries, write_new_scene
 from spherloc.mapping.stated_gravity import read_stated_gravity
 from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
 from spherloc.mapping.written import _gravity
@@ -394,11 +394,11 @@ def test_a_map_of_the_cameras_of_a_rig(rig, tmp_path):
     assert "of 2 cameras" in _kind(found.views)
     path, _ = add_new_images(made.written.scene, folder)
     assert {view.name for view in load_scene(path).queries} == set(poses)
-    for name in ("front", "left"):  # as of lenses that the photographs told
+    for name in ("front", "left"):  # as of lenses that the photographs told: of one of them, of both
         (folder / f"{name}.toml").rename(tmp_path / f"{name}.toml")
-    path, _ = add_new_images(made.written.scene, folder)
-    told = {view.name: view.camera.width for view in load_scene(path).queries}
-    assert told == {name: 480 if name.startswith("front") else 512 for name in poses}
+        path, _ = add_new_images(made.written.scene, folder)
+        told = {view.name: view.camera.width for view in load_scene(path).queries}
+        assert told == {name: 480 if name.startswith("front") else 512 for name in poses}
     for name in ("front", "left"):
         (tmp_path / f"{name}.toml").rename(folder / f"{name}.toml")
 
@@ -744,6 +744,40 @@ def test_new_images_are_counted_by_their_size(tmp_path, rng):
         new_images_of(new, mapped)
     with pytest.raises(InputError, match="empty: has no images; give a folder with images that are to be localized"):
         new_images_of(empty, mapped)
+
+
+def test_new_images_of_cameras_that_were_given(tmp_path, rng):
+    """Their calibration is not beside the images of the map, only in its model."""
+    images, model, new = tmp_path / "images", tmp_path / "map" / "model", tmp_path / "new"
+    for folder in (images, model, new):
+        folder.mkdir(parents=True)
+    for name, width in (("a.png", 400), ("b.png", 320)):
+        picture(images / name, width, 240, rng)
+        picture(new / name, width, 240, rng)
+    lenses = "1 OPENCV_FISHEYE 400 240 90 90 200 120 0 0 0 0\n2 OPENCV_FISHEYE 320 240 95 95 160 120 0 0 0 0\n"
+    (model / "cameras.txt").write_text(lenses)
+    (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 2 b.png\n\n")
+    (model / "points3D.txt").write_text("")
+    scene = tmp_path / "map" / "scene.toml"
+    scene.write_text(f'kind = "colmap"\nname = "given"\nmodel = "{MODEL}"\nimages = "../images"\n')
+    path, remarks = add_new_images(scene, new)
+    assert remarks == () and 'queries = ["a.png", "b.png"]' in path.read_text()
+    assert [line for line in path.read_text().splitlines() if line.startswith("fx")] == ["fx = 90.0", "fx = 95.0"]
+
+
+@pytest.mark.parametrize("name", ["scene", "lens", "lens_front"])
+def test_a_scene_of_new_images_is_not_called_as_another_file_of_the_map(tmp_path, name):
+    images = NewImages(tmp_path / name, None)
+    path = write_new_scene(MapHead("m", "", "..", (), ()), tmp_path, images, Equirectangular(64, 32))
+    assert path.name == f"new_{name}.toml"
+
+
+def test_all_folders_of_a_folder_count(tmp_path, rng):
+    camera = KannalaBrandt(40, 30, 9.0, 9.0, 20.0, 15.0, (0.0,) * 4)
+    for number in range(60):
+        (tmp_path / f"{number:02}").mkdir()
+        picture(tmp_path / f"{number:02}" / "a.png", 40, 30, rng)
+    assert len(photographs(tmp_path, {"lens": camera}).views) == 60
 
 
 def test_new_images_of_several_cameras(tmp_path, rng):

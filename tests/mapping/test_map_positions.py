@@ -91,6 +91,8 @@ def test_times_of_other_clocks(tmp_path, name):
     path.write_text("2.3 1 2 3 0 0 0 1\n2.7 3 2 3 0 0 0 1\n")
     found = read_positions(path, [View(name, VIEWS[0].camera, Path(name)), VIEWS[0]])
     np.testing.assert_allclose(found.by_name[name], [2.0, 2.0, 3.0])
+    np.savetxt(path, np.loadtxt(path))
+    np.testing.assert_allclose(read_positions(path, [View(name, VIEWS[0].camera, Path(name))]).by_name[name], [2, 2, 3])
 
 
 def test_rows_of_positions_and_of_gps(tmp_path):

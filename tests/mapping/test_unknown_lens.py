@@ -14,6 +14,7 @@ from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.datasets import load_scene
 from spherloc.errors import InputError
 from spherloc.geometry import so3_exp
+from spherloc.mapping import lens_fit
 from spherloc.mapping.image_circle import image_circle
 from spherloc.mapping.lens_fit import Circle, RadialLens, fit_lens
 from spherloc.mapping.photographs import photographs
@@ -63,6 +64,23 @@ def test_a_camera_that_only_went_straight_ahead_does_not_tell_its_lens(rng):
     pycolmap = registry.require("pycolmap", "colmap", "a test")
     _, off_rad = fit_lens(pycolmap, matched(rng, turned=False), RIM, lambda *_: None, is_circle=False)
     assert off_rad > MAX_OFF_RAD
+
+
+def test_a_kind_of_lens_that_fits_nothing_in_the_end_is_no_rival(rng, monkeypatch):
+    refined, seen = lens_fit._refined, []
+
+    def fails_for_rivals(pycolmap, pairs, lens, expected, bounds_px):
+        if bounds_px is lens_fit.BOUNDS_PX and len(pairs) == lens_fit.FIRST_PAIRS:
+            seen.append(lens)
+            raise ValueError
+        return refined(pycolmap, pairs, lens, expected, bounds_px)
+
+    monkeypatch.setattr(lens_fit, "FIRST_PAIRS", 5)
+    monkeypatch.setattr(lens_fit, "NEARLY", 0.0)  # all are rivals
+    monkeypatch.setattr(lens_fit, "_refined", fails_for_rivals)
+    pycolmap = registry.require("pycolmap", "colmap", "a test")
+    fit, _ = fit_lens(pycolmap, matched(rng, turned=True), RIM, lambda *_: None, is_circle=False)
+    assert seen and fit.matches > 0.6 * 12 * 150
 
 
 def test_bearings_of_a_lens_and_their_slopes(rng):

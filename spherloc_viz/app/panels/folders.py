@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from spherloc.datasets.given_path import images_in_folders
+from spherloc.datasets.given_path import MAX_FOLDERS, images_in_folders
 from spherloc.datasets.scene_file import read_table
 from spherloc.errors import InputError
 from spherloc.files import IMAGES
@@ -107,7 +107,7 @@ class Roots:
         rows = tuple(describe(path, own) for path, own in entries[PAGE * page : PAGE * (page + 1)])
         above = self.place(folder.parent)
         folders = [] if photographs or outside else [path.name for path, _ in entries if path.is_dir()]
-        counts = images_in_folders(folder, folders)
+        counts = images_in_folders(folder, folders, MAX_FOLDERS)
         return Listing(folder, self.place(folder) or "", above, rows, page, pages, remarks, photographs, counts)
 
     def _entries(self, folder: Path) -> tuple[list[tuple[Path, str]], tuple[str, ...], int, int]:

@@ -1,12 +1,14 @@
 """Makes a map of a folder's photographs in the background: progress, a button that stops it, and the report."""
 
 import json
+import os
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import viser
@@ -23,8 +25,6 @@ SCALE_HINT = (
     "distance, such as 1.jpg 5.jpg 12.5. A map that is there already is only scaled."
 )
 MAX_REPORT_BYTES = 500_000_000
-OUTPUT = "_map"
-"""What the folder of a map is called, after that of its photographs; as the command calls it."""
 
 
 class MapPanel:
@@ -59,12 +59,19 @@ class MapPanel:
                 return
             self._stopped = False
             command = [sys.executable, "-m", MODULE, str(folder), str(output), self._scale.value]
+            # A process that is stopped leaves its temporary files there.
+            scratch = TemporaryDirectory(prefix="spherloc-map-", ignore_cleanup_errors=True)
             self._process = process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                text=True,
+                env={**os.environ, "TMPDIR": scratch.name},
             )
         self._say(f"Making a map of {folder.name} …")
         self._bar.value, self._bar.visible, self._stop.visible = 0.0, True, True
-        threading.Thread(target=self._follow, args=(process, folder), name="spherloc-map", daemon=True).start()
+        threading.Thread(target=self._follow, args=(process, folder, scratch), name="spherloc-map", daemon=True).start()
 
     def close(self) -> None:
         """Stop what runs; does not wait. What was done is kept."""
@@ -73,7 +80,7 @@ class MapPanel:
             if self._process is not None:
                 self._process.terminate()
 
-    def _follow(self, process: "subprocess.Popen[str]", folder: Path) -> None:
+    def _follow(self, process: "subprocess.Popen[str]", folder: Path, scratch: "TemporaryDirectory[str]") -> None:
         said: dict[str, Any] = {}
         assert process.stdout is not None
         for line in process.stdout:
@@ -82,6 +89,7 @@ class MapPanel:
                 self._bar.value = 100.0 * said["done"] / max(1, said["count"])
                 self._say(f"{folder.name}: {said['done']:,} of {said['count']:,} {said['kind']} …")
         process.wait()
+        scratch.cleanup()
         with self._lock:
             self._process, stopped = None, self._stopped
         self._bar.visible = self._stop.visible = False

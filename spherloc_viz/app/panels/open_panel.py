@@ -13,11 +13,12 @@ from spherloc.datasets import Scene, bundled_scenes, load_scene
 from spherloc.disk_cache import cache_folder, store
 from spherloc.errors import InputError
 from spherloc.files import is_file
+from spherloc.mapping.advice import for_a_page
 from spherloc.mapping.new_queries import add_new_images, map_images
 from spherloc.mapping.photographs import MIN_IMAGES
-from spherloc.mapping.scene_files import SCENE
+from spherloc.mapping.scene_files import MAP_FOLDER, SCENE
 from spherloc_viz.app.panels.folders import Listing, Roots, Row, describe
-from spherloc_viz.app.panels.map_panel import OUTPUT, MapPanel
+from spherloc_viz.app.panels.map_panel import MapPanel
 from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_CALIBRATION_BYTES, File, Scratch, UploadForm, open_upload
 from spherloc_viz.app.text import DIM, begun, box, status_html
 from spherloc_viz.app.web.touch import Touch, Touches
@@ -70,7 +71,7 @@ def _folder_html(listing: Listing, in_map: str, made: bool) -> str:
     rows = [_row_html(above, "↑ up" if listing.parent else "↑ all folders", "")]
     if in_map and (count := listing.photographs or sum(listing.in_folders.values())):
         these, about = ("this photograph", ONE_ABOUT) if count == 1 else (f"these {count:,} photographs", NEW_ABOUT)
-        rows.append(_row_html(f"localize-folder:{listing.place}", f"Localize {these} in {in_map}", NEW_ABOUT))
+        rows.append(_row_html(f"localize-folder:{listing.place}", f"Localize {these} in {in_map}", about))
     if title := _map_title(listing):
         title, about = (f"{title} again", AGAIN_ABOUT) if made else (title, MAP_ABOUT)
         rows.append(_row_html(f"map-folder:{listing.place}", title, about))
@@ -283,10 +284,10 @@ class OpenPanel:
         self._map.start(folder, self._map_of(folder))
 
     def _map_of(self, folder: Path) -> Path:
-        """Where the map of a folder is put: beside it, as the command does, or inside it if pages may not write beside
-        it."""
+        """Where the map of a folder is put: beside it, or inside it if pages may not write beside it. The command puts
+        it where it is given."""
         above = folder if self._roots.place(folder.parent) is None else folder.parent
-        return above / f"{folder.name}{OUTPUT}"
+        return above / MAP_FOLDER.format(folder.name)
 
     def _localize(self, place: str) -> None:
         """Open a scene of a folder's photographs in the map that the page shows; it is written beside the map's own."""
@@ -294,7 +295,8 @@ class OpenPanel:
         if self._place(scene) is None:
             raise InputError("the map that is shown is not in an allowed folder; open a map from the list first.")
         self._say("Looking at the photographs …")
-        path, remarks = add_new_images(scene, folder)
+        with for_a_page():
+            path, remarks = add_new_images(scene, folder)
         self._open_file(path)
         self._say(" ".join(remarks))
 

@@ -26,7 +26,6 @@ MAX_BYTES = 10_000_000
 MAX_CALIBRATION_BYTES = 256 * 1024
 MAX_ROWS = 200_000
 MAX_NAME = 60
-"""Beyond any pixel and any map, so that squares and products of it are numbers."""
 
 
 @dataclass(frozen=True)
