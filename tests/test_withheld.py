@@ -16,7 +16,7 @@ from spherloc.trace import Trace
 from spherloc_viz import style
 from spherloc_viz.app.audience import AudienceControls
 from spherloc_viz.app.catalog import Run, RunRequest, SceneRequest
-from spherloc_viz.app.run_display import Places, RunDisplay
+from spherloc_viz.app.run_display import Callbacks, RunDisplay
 from spherloc_viz.app.text import WITHHELD
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
@@ -58,10 +58,10 @@ class Reader:
         )
         self._before = set(client.gui._gui_input_handle_from_uuid) | set(self._parts(client))
         controls = AudienceControls(client.gui, 340, lambda event: None)
-        places = Places(
+        callbacks = Callbacks(
             lambda event: None, lambda chosen, extend: None, None, lambda layer, name: None, lambda label: None
         )
-        self.display = RunDisplay(client, self.touches, controls, places, (380, 340))
+        self.display = RunDisplay(client, self.touches, controls, callbacks, (380, 340))
         self.touch(SEEN)
         self._client = client
 

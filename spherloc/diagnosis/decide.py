@@ -125,7 +125,7 @@ def with_truth(e: Evidence, t: Truth) -> Cause:
     within, twice = (np.count_nonzero(errors <= factor * e.bound_px) for factor in (1.0, 2.0))
     if twice >= SPREAD * max(1, within):
         return Cause.BOUND_TOO_SMALL
-    true, other = t.fit.support(e.bound_px), _other(e, t.fit)
+    true, other = t.fit.support(e.bound_px), _wrong_support(e, t.fit)
     if stands_out(e, other) and other >= EQUAL * true:
         return Cause.FALSE_CONSENSUS if true < EQUAL * other else Cause.AMBIGUOUS
     if t.success:
@@ -170,7 +170,7 @@ def missed(e: Evidence, best: int) -> bool:
     return e.run is None or e.run.support(e.bound_px) < MISSED * best
 
 
-def _other(e: Evidence, true: Fit) -> int:
+def _wrong_support(e: Evidence, true: Fit) -> int:
     """Largest support of a pose that is clearly different from the true one."""
     fits = [fit for fit in (e.run, e.best, e.alternative) if fit is not None]
     wrong = [fit for fit in fits if different(fit.cam_from_map, true.cam_from_map)]

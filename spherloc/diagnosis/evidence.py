@@ -396,12 +396,12 @@ def agreeing(trace: Trace, errors_px: FloatArray) -> BoolArray:
     return errors_px <= (bounds_of(trace.problem.aligned, bound_px).pixels if kept else bound_px)
 
 
-def _free_tilt_sd(aligned: AlignedProblem, free: Fit, bound_px: float) -> float:
-    mask = free.errors_px <= bound_px
+def _free_tilt_sd(aligned: AlignedProblem, fit: Fit, bound_px: float) -> float:
+    mask = fit.errors_px <= bound_px
     if np.count_nonzero(mask) < 4:
         return np.inf
-    noise_px = float(np.sqrt(np.mean(np.square(free.errors_px[mask])) / 2.0))
-    return pose_sd(aligned, free.cam_from_map, mask, max(noise_px, 1e-3), np.inf, 0)[2]
+    noise_px = float(np.sqrt(np.mean(np.square(fit.errors_px[mask])) / 2.0))
+    return pose_sd(aligned, fit.cam_from_map, mask, max(noise_px, 1e-3), np.inf, 0)[2]
 
 
 def gather_truth(trace: Trace, bound_px: float) -> Truth | None:

@@ -39,7 +39,7 @@ def describe(
     if cause is Cause.BOUND_TOO_LARGE and narrow is not None:
         other, summary = narrow.fit, _narrow_summary(e, narrow)
     else:
-        other = _other(e, truth, cause)
+        other = _fit_beside(e, truth, cause)
         summary = _summary(e, truth, cause, other, trace.problem.unit)
     return Diagnosis(
         cause=cause,
@@ -74,7 +74,7 @@ def _advice(trace: Trace, e: Evidence, truth: Truth | None, cause: Cause) -> str
     return ADVICE[cause]
 
 
-def _other(e: Evidence, truth: Truth | None, cause: Cause) -> Fit | None:
+def _fit_beside(e: Evidence, truth: Truth | None, cause: Cause) -> Fit | None:
     """The pose to look at beside the run's own, if there is one."""
     if cause is Cause.OK:
         return None

@@ -13,7 +13,7 @@ from spherloc.diagnosis import Diagnosis
 from spherloc_viz.app.catalog import Run
 from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.edits import Edits
-from spherloc_viz.app.run_display import Places, RunDisplay
+from spherloc_viz.app.run_display import Callbacks, RunDisplay
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Status
@@ -63,8 +63,8 @@ class Audience:
         self._page = LatestWorker(f"spherloc-page-{client.client_id}", self._draw)
         left_px, right_px = panel_widths_px(client.camera.image_width)
         controls = AudienceControls(client.gui, right_px, self._redraw)
-        places = Places(self._redraw, self._select, None, lambda layer, name: None, lambda label: None)
-        self._display = RunDisplay(client, self._touches, controls, places, (left_px, right_px))
+        callbacks = Callbacks(self._redraw, self._select, None, lambda layer, name: None, lambda label: None)
+        self._display = RunDisplay(client, self._touches, controls, callbacks, (left_px, right_px))
         self._touches.on("select", self._select_numbers)
         self._touches.on("deselect", lambda touch: self._select(()))
         # Only now may the page report presses: all handlers are registered.

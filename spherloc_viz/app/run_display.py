@@ -69,7 +69,7 @@ class Panel(Protocol):
 
 
 @dataclass(frozen=True)
-class Places:
+class Callbacks:
     """Functions that ``RunDisplay`` calls when the user does something on it."""
 
     redraw: Callable[[object], None]
@@ -92,17 +92,27 @@ class RunDisplay:
     """One client's page. Everything is drawn on the session's page thread."""
 
     def __init__(
-        self, client: viser.ClientHandle, touches: Touches, controls: Panel, places: Places, widths_px: tuple[int, int]
+        self,
+        client: viser.ClientHandle,
+        touches: Touches,
+        controls: Panel,
+        callbacks: Callbacks,
+        widths_px: tuple[int, int],
     ) -> None:
         """``widths_px`` are those of the panels left and right of the canvas."""
         self._client, self.controls = client, controls
-        select, movable = places.select, places.move is not None
+        select, movable = callbacks.select, callbacks.move is not None
         self.panels = LeftPanels(
-            client.gui, touches, places.redraw, lambda chosen: select(chosen, False), places.scene_of, widths_px[0]
+            client.gui,
+            touches,
+            callbacks.redraw,
+            lambda chosen: select(chosen, False),
+            callbacks.scene_of,
+            widths_px[0],
         )
         self.card = MatchCard(client.gui, movable, text_scale(client.camera.image_width))
-        moved = places.move or (lambda place: None)
-        self.canvas = Canvas(client, self.controls.display, select, moved, places.photograph, sum(widths_px))
+        moved = callbacks.move or (lambda place: None)
+        self.canvas = Canvas(client, self.controls.display, select, moved, callbacks.photograph, sum(widths_px))
         self._widths_px = widths_px
         self._shown: tuple[Run, bytes | None, Picture] | None = None
         self._map: tuple[str, MapScene, bytes | None] | None = None
@@ -116,9 +126,9 @@ class RunDisplay:
         self._outcome: tuple[Trace, Judgement | None, Table] | None = None
         self._to_prepare: deque[Callable[[], None]] = deque()
         """What paints the steps around the one at hand, the nearest first."""
-        self._scene_of = places.scene_of
+        self._scene_of = callbacks.scene_of
         self._theme = START_THEME
-        self._redraw = places.redraw
+        self._redraw = callbacks.redraw
         touches.on("reveal", self._reveal)
         touches.on("projector", self._project)
         touches.on("window", self._fit_window)

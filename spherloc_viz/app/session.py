@@ -35,7 +35,7 @@ from spherloc_viz.app.panels.compare_panel import VIEW as COMPARE
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.review.opened import Opened
-from spherloc_viz.app.run_display import Places, RunDisplay
+from spherloc_viz.app.run_display import Callbacks, RunDisplay
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Notices, Status
@@ -107,8 +107,10 @@ class Session:
         """Whether all widgets are there: the first of them may be used before the last one is made."""
         left_px, right_px = panel_widths_px(client.camera.image_width)
         self._controls = Controls(client, self._catalog, services, self._touches, self, right_px)
-        places = Places(self.redraw, self.select, self._move_camera, self._press_photograph, self._catalog.map_scene)
-        self._display = RunDisplay(client, self._touches, self._controls, places, (left_px, right_px))
+        callbacks = Callbacks(
+            self.redraw, self.select, self._move_camera, self._press_photograph, self._catalog.map_scene
+        )
+        self._display = RunDisplay(client, self._touches, self._controls, callbacks, (left_px, right_px))
         self._listen()
         self._built = True
         # Only now may the page report presses: all handlers are registered.
