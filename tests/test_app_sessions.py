@@ -22,7 +22,7 @@ from spherloc.trace import Trace
 from spherloc_viz import layers
 from spherloc_viz.app import compilation, run_display
 from spherloc_viz.app import session as session_module
-from spherloc_viz.app.catalog import Catalog, Run
+from spherloc_viz.app.catalog import Catalog, Run, RunRequest, SceneRequest
 from spherloc_viz.app.compilation import Compilation
 from spherloc_viz.app.server import Sessions
 from spherloc_viz.app.services import Services
@@ -226,6 +226,24 @@ def test_stepping_solves_nothing(house: House, monkeypatch: pytest.MonkeyPatch) 
     page.set(session._controls.display._layers["map"], False)
     until(lambda: not session._display.canvas._painter._drawn["map/points"][0].visible)
     assert len(house.notes.traces) == 1
+
+
+def test_a_pressed_reference_is_shown_beside_the_query(house: House) -> None:
+    _, session = house.visit()
+    catalog = session._catalog
+    street = load_scene(bundled_scenes()["street_fisheye"])
+    assert isinstance(street, MapScene)
+    label = next(label for label, scene in catalog.scenes.items() if scene.name == street.name)
+    session.open(RunRequest(SceneRequest(label, 0), "ransac-2p", None))
+    until(lambda: session._run is not None and session._run.request.scene.scene == label)
+    matched = [path.name for path in session._run.trace.problem.reference_images]
+    view = next(view for view in street.references if view.path.name in matched)
+    number = matched.index(view.path.name)
+    press = session._press_photograph
+    press("point cloud", view.name)
+    assert session._display.panels._images._wanted == number and session._display.panels.tab == "Images"
+    press("point cloud", "elsewhere.jpg")
+    until(lambda: "This query was not matched with elsewhere.jpg." in session._status._line.content)
 
 
 def test_steps_around_the_one_at_hand_are_painted_before_they_are_asked_for(

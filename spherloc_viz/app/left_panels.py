@@ -139,6 +139,11 @@ class LeftPanels:
         if elsewhere:
             self._elsewhere = _once_more(elsewhere, self._elsewhere)
 
+    def show_reference(self, number: int) -> None:
+        """Bring the images to the front, the query with that reference."""
+        self.open_tab("Images")
+        self._images.show_reference(number)
+
     def begin_opening(self, label: str) -> None:
         """Until a run of this scene is shown, say that the panels still show the scene before."""
         self._opening = label

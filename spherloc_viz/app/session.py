@@ -44,7 +44,6 @@ from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.app.web.viser_internals import at_once, follow_changes, guard_callbacks, is_linked, update_widget
 from spherloc_viz.app.workers import Job, LatestWorker
 from spherloc_viz.layers import steps
-from spherloc_viz.layers.matches import matches_with
 from spherloc_viz.layers.withheld import TOLD
 from spherloc_viz.lessons.numbers import number_text, numbers_of
 
@@ -241,7 +240,7 @@ class Session:
         self.changed()
 
     def _press_photograph(self, layer: str, name: str) -> None:
-        """Open the query of a localized sequence whose dot was pressed; of a reference, select its matches."""
+        """Open the query of a localized sequence whose dot was pressed; show a reference beside the query at hand."""
         run = self._run
         if run is None:
             return
@@ -250,12 +249,11 @@ class Session:
             return
         scene = self._catalog.map_scene(run.request.scene.scene)
         image = next((view.path for view in scene.references if view.name == name), None) if scene else None
-        found = matches_with(run.trace.problem, image)
-        if len(found):
-            self._display.panels.open_tab("Images")
-            self.select(found.tolist())
+        references = run.trace.problem.reference_images
+        if image in references:
+            self._display.panels.show_reference(references.index(image))
         else:
-            self._status.say(f"{name} has no match with this query.")
+            self._status.say(f"This query was not matched with {name}.")
 
     def shown(self) -> Shown | None:
         """What is on the page, to be exported."""

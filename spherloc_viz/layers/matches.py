@@ -174,13 +174,6 @@ def match_view(
     return MatchView(shown, own, np.union1d(joined, chosen), len(inliers), caption)
 
 
-def matches_with(problem: Problem, image: Path | None) -> IntArray:
-    """Indices (K,) of the matches with a reference image; none if the query was not matched with it."""
-    if problem.reference_index is None or image not in problem.reference_images:
-        return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero(problem.reference_index == problem.reference_images.index(image))
-
-
 def reference_votes(problem: Problem, inlier_mask: BoolArray) -> tuple[IntArray, IntArray]:
     """Numbers of inliers (R,) and of matches (R,) of every reference image; empty without references."""
     count = len(problem.reference_images)

@@ -104,9 +104,13 @@ class ImagePanel:
         _assign(self._backgrounds, drawing.backgrounds_html(uris))
         _assign(self._drawing, html)
 
+    def show_reference(self, number: int | None) -> None:
+        """Show the query with that reference from now on, or None for the one that the selection suggests."""
+        self._wanted = number
+        self._changed(None)
+
     def _want(self, touch: Touch) -> None:
-        self._wanted = int(touch.argument) if touch.argument.isdecimal() else None
-        self._changed(touch)
+        self.show_reference(int(touch.argument) if touch.argument.isdecimal() else None)
 
     def _pick(self, touch: Touch) -> None:
         """Select the match nearest to a press, if one is near."""
