@@ -260,10 +260,16 @@ class RunDisplay:
 
     def prepare(self) -> bool:
         """Paint one of the steps that may be asked for next; false if there is none that is not painted."""
-        if not self._to_prepare:
+        try:
+            paint_one = self._to_prepare.popleft()
+        except IndexError:
             return False
-        self._to_prepare.popleft()()
+        paint_one()
         return True
+
+    def stop_preparing(self) -> None:
+        """Paint no step ahead until the next picture; on any thread."""
+        self._to_prepare.clear()
 
     def _paint_ahead(self, run: Run, index: int, selected: tuple[int, ...], told: bool) -> None:
         self.panels.prepare(run, paint(run.trace, index, told), selected, not told)

@@ -149,6 +149,7 @@ class Session:
         """A widget that a run depends on was changed on the page by its user."""
         if self._built:
             self._controls.slow.outdate()
+            self._display.stop_preparing()
         self._solver.ask()
 
     @at_once

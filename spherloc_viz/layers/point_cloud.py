@@ -20,7 +20,7 @@ SHARE, REACH = 0.9, 2.0
 BODY, SMALLEST_BODY = 0.3, 0.01
 """Size of the camera of a reference, as a share of the usual distance of references from their nearest ones, but at
 least the second share of the extent of all."""
-DOT, REFERENCE_DOT = 0.0007, 0.01
+DOT, REFERENCE_DOT = 0.0004, 0.01
 """Radius of a point's dot, as a share of the extent of the points, and of a reference's, of that of the references."""
 MAX_NAMED = 12
 """Largest number of references, and of localized queries, whose names are shown."""
