@@ -166,7 +166,7 @@ def test_the_note_is_true_of_one_node_and_of_few(mc: Trace) -> None:
     stage = mc.stage(TranslationStage)
     assert stage is not None
     assert f"of {len(np.unique(stage.pairs[stage.clique]))} matches, which the Matches tab lists" in notes["clique"]
-    assert notes["clique"].startswith("The list above has the balls of the clique first.")
+    assert notes["clique"].startswith("The list, a button above, has the balls of the clique first.")
 
 
 def test_all_balls_are_listed_with_the_clique_first(mc: Trace) -> None:

@@ -434,7 +434,8 @@ def test_runs_without_pose_truth_or_labels_can_be_drawn(server: viser.ViserServe
     for run in runs.values():
         bare = replace(run.problem, truth_inliers=None, truth_cam_from_map=None)
         view.draw(replace(run, problem=bare), "", (), np.arange(120))
-        assert "by this run&#x27;s inliers" in view._html.content and ">truth<" not in view._html.content
+        assert "Inliers and outliers are this run&#x27;s." in view._html.content and ">truth<" not in view._html.content
+        assert "both outliers" in view._html.content and not re.search("both right|one wrong", view._html.content)
         view.draw(replace(run, cam_from_map=None, inlier_mask=np.zeros(120, bool)), "", (2,), np.arange(120))
         assert ElementTree.fromstring(f"<p>{view._html.content}</p>") is not None
         view.draw(replace(run, stages=()), "", (), np.arange(120))

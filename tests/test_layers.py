@@ -12,6 +12,7 @@ from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.estimators import estimate
 from spherloc.estimators.ransac import RansacOptions
 from spherloc.geometry import camera_centre, transform, yaw_of
+from spherloc.metrics import evaluate
 from spherloc.problem import Problem
 from spherloc.trace import (
     Certificate,
@@ -25,7 +26,9 @@ from spherloc.trace import (
 from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.ball_set import MAX_SURFACES
+from spherloc_viz.layers.frame import angle_text
 from spherloc_viz.layers.outcome import outcome_table
+from spherloc_viz.layers.point_cloud import WRONG_RAYS
 from spherloc_viz.layers.primitives import Balls, Curve, Label, Mesh, Picture, Points, SceneItem, Segments, Textured
 
 SCENES = sorted(name for name, path in bundled_scenes().items() if 'kind = "synthetic"' in path.read_text())
@@ -324,6 +327,24 @@ def test_outcome_colours_say_inlier_and_outlier(mc: Trace) -> None:
     assert isinstance(rays, Segments) and len(rays.points) == np.count_nonzero(mc.inlier_mask)
 
 
+def test_lines_to_inliers_that_are_wrong_turn_red(mc: Trace) -> None:
+    wrong = np.flatnonzero(mc.inlier_mask)[::3]
+    truth = mc.inlier_mask.copy()
+    right = replace(mc, problem=replace(mc.problem, truth_inliers=truth.copy()))
+    truth[wrong] = False
+    run = replace(mc, problem=replace(mc.problem, truth_inliers=truth))
+    whole, picture = item(at(right, "outcome"), "rays"), at(run, "outcome")
+    rays, halves = item(picture, "rays"), item(picture, WRONG_RAYS)
+    assert isinstance(whole, Segments) and isinstance(rays, Segments) and isinstance(halves, Segments)
+    assert is_color(rays.colors, style.INLIER).all() and is_color(halves.colors, style.OUTLIER).all()
+    spoiled = np.isin(np.flatnonzero(mc.inlier_mask), wrong)
+    np.testing.assert_array_equal(rays.points[~spoiled], whole.points[~spoiled])
+    np.testing.assert_array_equal(rays.points[spoiled, 0], whole.points[spoiled, 0])
+    np.testing.assert_array_equal(rays.points[spoiled, 1], halves.points[:, 0])
+    np.testing.assert_array_equal(halves.points[:, 1], whole.points[spoiled, 1])
+    assert "turn red" in picture.step.note and "turn red" not in at(right, "outcome").step.note
+
+
 def test_inlier_rays_leave_the_sphere_radially_at_the_final_pose(mc: Trace) -> None:
     """The bearing's dot, the map point and the centre of the sphere are in one line for an inlier."""
     picture = at(mc, "outcome")
@@ -388,6 +409,8 @@ def test_thinning_is_stated_with_its_numbers(mc: Trace) -> None:
 def test_yaw_chart_shows_overlap_truth_and_estimate(mc: Trace) -> None:
     stage = mc.stage(YawStage)
     assert stage is not None and mc.problem.truth_cam_from_map is not None
+    note = at(mc, "yaw-clique").step.note
+    assert f"the pose of the outcome is {angle_text(evaluate(mc).rotation_error_deg)} off" in note
     curves = {curve.label: curve for curve in at(mc, "yaw-clique").charts[0].curves}
     np.testing.assert_array_equal(curves["that overlap"].y, stage.overlap)
     assert curves["estimate"].x[0] == pytest.approx(np.degrees(stage.yaw_rad))

@@ -13,7 +13,15 @@ from spherloc.geometry import camera_centre, pose, yaw_rotation
 from spherloc_viz import style
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.frame import length_text
-from spherloc_viz.layers.point_cloud import FEW_RAYS, MAX_NAMED, MAX_POINTS, REFERENCES, cloud_items, with_few_rays
+from spherloc_viz.layers.point_cloud import (
+    FEW_RAYS,
+    MAX_NAMED,
+    MAX_POINTS,
+    REFERENCES,
+    WRONG_RAYS,
+    cloud_items,
+    with_few_rays,
+)
 from spherloc_viz.layers.primitives import Label, Points, Segments
 from spherloc_viz.layers.where_taken import where_taken
 
@@ -58,12 +66,20 @@ def test_of_many_lines_to_inliers_an_even_sample_is_drawn_and_told() -> None:
     all_rays = paint(trace, len(steps(trace)) - 1)
     (rays,) = (item for item in all_rays.scene if item.name == "rays")
     assert isinstance(rays, Segments) and 0 < len(rays.points) <= FEW_RAYS and with_few_rays(all_rays, 20) is all_rays
-    many = replace(rays, points=np.repeat(rays.points, 9, axis=0), colors=np.repeat(rays.colors, 9, axis=0))
+    repeated = np.repeat(rays.points, 9, axis=0)
+    apart = repeated + 1e-3 * np.arange(len(repeated))[:, None, None]
+    many = replace(rays, points=apart, colors=np.repeat(rays.colors, 9, axis=0))
     crowded = replace(all_rays, scene=tuple(many if item is rays else item for item in all_rays.scene))
     (few,) = (item for item in with_few_rays(crowded, 701).scene if item.name == "rays")
     assert isinstance(few, Segments) and len(few.points) == len(few.colors) == FEW_RAYS
     assert np.array_equal(few.points[[0, -1]], many.points[[0, -1]])
     assert f"{FEW_RAYS} of the 701 lines" in with_few_rays(crowded, 701).step.note
+    wrong = replace(many, name=WRONG_RAYS, points=many.points[:, ::-1])  # each begins where a line ends
+    others = tuple(item for item in crowded.scene if item.name != WRONG_RAYS)
+    thinned = with_few_rays(replace(crowded, scene=(*others, wrong)), 701)
+    (halves,) = (item for item in thinned.scene if item.name == WRONG_RAYS)
+    assert isinstance(halves, Segments) and len(halves.points) == len(halves.colors) < len(many.points)
+    assert {tuple(end) for end in halves.points[:, 0]} == {tuple(end) for end in few.points[:, 1]}
 
 
 def test_few_references_are_named() -> None:

@@ -92,6 +92,9 @@ def _no_pose(view: RunView) -> Frame:
     )
 
 
+TURNING = "Lines that turn red lead to inliers that are wrong by the truth."
+
+
 def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
     trace, metrics = view.trace, evaluate(view.trace)
     remark = trace.message.partition(". ")[2]
@@ -115,13 +118,15 @@ def _pose(view: RunView, cam_from_map: np.ndarray) -> Frame:
             f"{proven}. The pose, solved in {total:.1f} ms, is {angle} and {length} off the truth: {verdict} by the "
         )
         caption += f"limits of 1° and {limit}."
+    right = trace.problem.truth_inliers
+    turning = "" if right is None or right[trace.inlier_mask].all() else TURNING
     return Frame(
         caption,
         limits,
         cam_from_map,
         view.colors(style.OUTLIER, (trace.inlier_mask, style.INLIER)),
         trace.inlier_mask,
-        note=f"{chances} {remark}".strip(),
+        note=" ".join(filter(None, (turning, chances, remark))),
         located=True,
         focus=map_focus(view, cam_from_map, trace.inlier_mask),
     )

@@ -26,6 +26,8 @@ MAX_NAMED = 12
 """Largest number of references, and of localized queries, whose names are shown."""
 REFERENCES = "cloud/references"
 """Name of the dots where the references were taken."""
+WRONG_RAYS = "rays-wrong"
+"""Name of the second halves of the lines to inliers that are wrong by the truth."""
 FEW_RAYS = 40
 """Largest number of lines to the inliers at the outcome of a query image, which is about where it was taken."""
 
@@ -49,6 +51,11 @@ def with_few_rays(picture: Picture, inliers: int) -> Picture:
     few = replace(rays, points=rays.points[kept], colors=rays.colors[kept])
     note = f"{picture.step.note} {FEW_RAYS} of the {inliers:,} lines to the inliers are drawn.".strip()
     scene = tuple(few if item is rays else item for item in picture.scene)
+    wrong = next((item for item in scene if item.name == WRONG_RAYS), None)
+    if isinstance(wrong, Segments):  # the halves of those lines that are left
+        own = (wrong.points[:, None, 0] == few.points[None, :, 1]).all(axis=2).any(axis=1)
+        halves = replace(wrong, points=wrong.points[own], colors=wrong.colors[own])
+        scene = tuple(halves if item is wrong else item for item in scene)
     return replace(picture, step=replace(picture.step, note=note), scene=scene)
 
 

@@ -12,11 +12,11 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.experiments.results import QueryResult
 from spherloc.geometry import camera_centre
 from spherloc.problem import Problem
-from spherloc.types import ByteArray, FloatArray
+from spherloc.types import ByteArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers.camera_shape import CORNERS, camera
 from spherloc_viz.layers.frame import Frame, RunView, even, icosphere, one_color
-from spherloc_viz.layers.point_cloud import MAX_NAMED
+from spherloc_viz.layers.point_cloud import MAX_NAMED, WRONG_RAYS
 from spherloc_viz.layers.primitives import Label, Mesh, Points, SceneItem, Segments, Textured
 from spherloc_viz.layers.query_image import modified, sphere_texture
 from spherloc_viz.layers.scale_bar import round_length, scale_bar
@@ -108,12 +108,26 @@ def _sphere(view: RunView, frame: Frame) -> list[SceneItem]:
     key = frame.cam_from_map.tobytes(), frame.sphere_aside, _changed(view.trace.problem)
     surfaces, dots = view.kept("sphere", key, lambda: _placed_sphere(view, frame))
     drawn = even(np.flatnonzero(frame.rays[aligned.index]), style.MAX_DRAWN_RAYS)
-    ends = np.stack([dots[drawn], view.points[aligned.index[drawn]]], axis=1)
     colors = frame.colors[aligned.index]
     return [
         *surfaces,
         Points("sphere/bearings", "sphere", dots, colors, 0.04 * view.dot_m, aligned.index),
-        Segments("rays", "rays", ends, colors[drawn], 1.5),
+        *_rays(view, dots[drawn], aligned.index[drawn], colors[drawn]),
+    ]
+
+
+def _rays(view: RunView, starts: FloatArray, matches: IntArray, colors: ByteArray) -> list[SceneItem]:
+    """The lines from bearings (R, 3) to the map points of their matches (R,), in colours (R, 3); from their middle on
+    those of matches that are wrong by the truth have the outliers' colour."""
+    ends, right = np.stack([starts, view.points[matches]], axis=1), view.trace.problem.truth_inliers
+    if right is None or right[matches].all():
+        return [Segments("rays", "rays", ends, colors, 1.5)]
+    wrong = np.flatnonzero(~right[matches])
+    halves = np.stack([ends[wrong].mean(axis=1), ends[wrong, 1]], axis=1)
+    ends[wrong, 1] = halves[:, 0]
+    return [
+        Segments("rays", "rays", ends, colors, 1.5),
+        Segments(WRONG_RAYS, "rays", halves, one_color(style.OUTLIER, len(halves)), 1.5),
     ]
 
 

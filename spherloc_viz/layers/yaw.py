@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from spherloc.consensus.yaw_arcs import YawConsensus, deepest_yaw
 from spherloc.geometry import wrap_angle, yaw_rotation
+from spherloc.metrics import evaluate
 from spherloc.trace import YawStage
 from spherloc.types import BoolArray, FloatArray, IntArray
 from spherloc_viz import style
 from spherloc_viz.layers import ring
-from spherloc_viz.layers.frame import Frame, Plan, RunView, even, growing, one_color, ring_focus
+from spherloc_viz.layers.frame import Frame, Plan, RunView, angle_text, even, growing, one_color, ring_focus
 from spherloc_viz.layers.primitives import Chart, Focus, SceneItem, Segments, true_minus
 
 INNER, OUTER = 1.3, 1.95
@@ -452,6 +453,9 @@ def _clique(view: RunView, arcs: StageArcs) -> Frame:
         note += f" An even sample of {len(drawn)} of {count:,} arcs is drawn, half of them from the clique."
     interval = np.degrees(stage.best_rad[1] - stage.best_rad[0])
     off = ring.off_truth(view, stage.yaw_rad)
+    error_deg = evaluate(view.trace).rotation_error_deg
+    if off and error_deg is not None:
+        note = f"The refinement turns the camera, too: the pose of the outcome is {angle_text(error_deg)} off. {note}"
     items = _ring(view, arcs, drawn, stage.overlap, arcs.in_clique[drawn], style.CLIQUE, (stage.yaw_rad,))
     return Frame(
         f"{len(stage.clique):,} arcs, each of a pair of matches, overlap at {np.degrees(stage.yaw_rad):.2f}°{off}; no "

@@ -115,6 +115,8 @@ MAX_CHOSEN = 24
 MAX_MATCHES, MAX_INLIERS = 32, 20
 """For a run that stores no arcs: number of matches whose pairs are computed, and of inliers among them."""
 KINDS = ("both right", "one wrong", "both wrong")
+KINDS_BY_RUN = ("both inliers", "one outlier", "both outliers")
+"""Kinds of pairs, and what they are called where the truth is not known."""
 ROUNDING_RAD = 1e-9
 """More than what is lost between radians and degrees."""
 CELLS = 240
@@ -159,6 +161,8 @@ class ArcBars:
     """(B,) row of each arc in the window, from the top; -1 outside of it."""
     total: tuple[int, int, int]
     """Number of arcs in the window of each kind, drawn or not."""
+    kinds: tuple[str, str, str] = KINDS
+    """What the kinds are called."""
 
     @property
     def rows(self) -> int:
@@ -166,11 +170,9 @@ class ArcBars:
         return int(self.row.max(initial=-1)) + 1
 
 
-def right_ones(trace: Trace) -> tuple[NDArray[np.bool_], str]:
-    """Which matches (N,) are right, by the truth where it is known, else by the run's inliers; and which it was."""
-    if trace.problem.truth_inliers is not None:
-        return trace.problem.truth_inliers, "by the truth"
-    return trace.inlier_mask, "by this run's inliers"
+def right_ones(trace: Trace) -> NDArray[np.bool_]:
+    """Which matches (N,) are right, by the truth where it is known, else by the run's inliers."""
+    return trace.inlier_mask if trace.problem.truth_inliers is None else trace.problem.truth_inliers
 
 
 def arcs_of(trace: Trace, selected: tuple[int, ...]) -> PairArcs:
@@ -273,7 +275,7 @@ def bars_in(trace: Trace, arcs: PairArcs, window: Window, selected: tuple[int, .
     """Selected pairs, wherever their arcs are, and pairs with an arc in a window: an even sample with an equal share of
     each kind.
     """
-    right, _ = right_ones(trace)
+    right = right_ones(trace)
     inside = _in_window(arcs, window)
     pairs = arcs.pairs[inside]
     kind = 2 - right[pairs[:, 0]].astype(np.int64) - right[pairs[:, 1]]
@@ -305,6 +307,7 @@ def bars_in(trace: Trace, arcs: PairArcs, window: Window, selected: tuple[int, .
         hi_deg=hi_deg,
         row=_rows(lo_deg, hi_deg, kinds[owner], window),
         total=(len(of_kind[0]), len(of_kind[1]), len(of_kind[2])),
+        kinds=KINDS if trace.problem.truth_inliers is not None else KINDS_BY_RUN,
     )
 
 

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from playground import SCENE, Playground
+from playground import SCENE, SIZE, Playground
 from playwright.sync_api import Browser, expect
 
 from spherloc.estimators import estimate
@@ -199,7 +199,13 @@ def test_the_introduction_is_shown_once_and_can_be_skipped(browser: Browser, add
         return bool(above and below) and 0 <= below["y"] - above["y"] - above["height"] < 40 and above["height"] > 420
 
     tab.until(shares_a_phone, "the canvas of a phone ends above the card")
-    tab.page.keyboard.press("Escape")
+    tab.page.set_viewport_size(SIZE)  # pyright: ignore[reportArgumentType]
+    for number in ("2 of 4", "3 of 4", "4 of 4"):
+        card.get_by_role("button", name="Continue").click()
+        expect(card).to_contain_text(number)
+    expect(tab.step).to_have_value(re.compile("Outcome"))
+    tab.press("Previous")  # whoever goes on with the page needs the last card no more
     expect(card).to_have_count(0)
+    expect(tab.step).to_have_value(re.compile("Refinement"))
     tab.expect_quiet(address)
     tab.close()

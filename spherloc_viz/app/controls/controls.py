@@ -237,7 +237,7 @@ class Controls:
         gui.main_panel.set_width(width_px)
 
     def _build_play(self, gui: viser.GuiApi, touches: Touches) -> None:
-        gui.add_html(heading_html("Drag a slider: it is solved anew meanwhile", "estimator"))
+        gui.add_html(heading_html("Drag a slider: each move is solved at once", "estimator"))
         self._preset = gui.add_dropdown(
             "Preset",
             preset_names(self._presets, False),

@@ -58,7 +58,7 @@ RECIPES = (
     _Recipe(
         "RANSAC bad luck",
         "90 % of the matches are wrong, and none of RANSAC's 100 samples is a pair of right ones: take another seed or "
-        "1000 samples.",
+        "1000 iterations.",
         "mei_outliers_90",
         2,
         estimator="ransac-2p",

@@ -121,7 +121,7 @@ def _listed(graph: Graph) -> list[str]:
     if graph.color != style.CLIQUE or not graph.marked.any():
         return []
     count = len(np.unique(graph.nodes.matches[graph.marked]))
-    first = "The list above has the balls of the clique first. " if graph.list_balls is not None else ""
+    first = "The list, a button above, has the balls of the clique first. " if graph.list_balls is not None else ""
     return [f'{first}Marked: nodes of {count:,} matches, which the Matches tab lists ("{IN_CLIQUE}").']
 
 

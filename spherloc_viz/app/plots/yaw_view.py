@@ -23,7 +23,6 @@ from spherloc_viz.layers.primitives import Chart, Curve
 from spherloc_viz.layers.yaw import CANDIDATE
 from spherloc_viz.layers.yaw_story import (
     ALL,
-    KINDS,
     ArcBars,
     PairArcs,
     Window,
@@ -34,7 +33,6 @@ from spherloc_viz.layers.yaw_story import (
     bars_in,
     peak_window,
     places_of,
-    right_ones,
     spans_in,
     window_around,
     yaw_story,
@@ -216,7 +214,7 @@ def _bars(bars: ArcBars, whole: Scale, part: Scale, pitch: float, window: Window
     for (a, b), kind, chosen, path, link, tip in rows:
         tag = f'class="yaw-arc" data-touch="select:{a},{b}" d="{path}" {LOOKS[kind]}{EDGE if chosen else ""}'
         if path:
-            out.append(f"<path {tag}><title>{a} and {b}, {KINDS[kind]}: {tip}</title></path>")
+            out.append(f"<path {tag}><title>{a} and {b}, {bars.kinds[kind]}: {tip}</title></path>")
         if link:
             out.append(f'<path class="yaw-second{" chosen" if chosen else ""}" d="{link}" {LINK}/>')
     return out
@@ -441,7 +439,7 @@ def bars_html(bars: ArcBars) -> str:
     kinds = np.unique(bars.kind[bars.owner[bars.row >= 0]]).tolist()
     samples = "".join(
         f'<span style="white-space:nowrap"><svg width="16" height="8"><path d="M0 0h16v8H0z" {LOOKS[kind]}/></svg>'
-        f" {KINDS[kind]}</span>"
+        f" {bars.kinds[kind]}</span>"
         for kind in kinds
     )
     look = "font-size:12px;display:flex;flex-wrap:wrap;column-gap:.9em;padding-bottom:.2em"
@@ -456,13 +454,14 @@ def caption(trace: Trace, story: YawStory, arcs: PairArcs, bars: ArcBars) -> str
     in_window = bars.row >= 0
     shown = int(np.count_nonzero(in_window))
     if shown < total:
-        kinds = np.bincount(bars.kind[bars.owner[in_window]], minlength=len(KINDS)).tolist()
-        counts = ", ".join(f"{n:,} of {of:,} {name}" for n, of, name in zip(kinds, bars.total, KINDS, strict=True))
+        kinds = np.bincount(bars.kind[bars.owner[in_window]], minlength=len(bars.kinds)).tolist()
+        counts = ", ".join(f"{n:,} of {of:,} {name}" for n, of, name in zip(kinds, bars.total, bars.kinds, strict=True))
         rule = f"{shown:,} of {total:,} arcs in this window shown, an even sample: {counts}."
     else:
-        counts = ", ".join(f"{of:,} {name}" for of, name in zip(bars.total, KINDS, strict=True))
+        counts = ", ".join(f"{of:,} {name}" for of, name in zip(bars.total, bars.kinds, strict=True))
         rule = f"All {total:,} arcs" if total > 1 else "The only arc"
         rule = f"{rule} in this window shown: {counts}."
-    colors = f"Right or wrong {right_ones(trace)[1]}."
+    by_run = trace.problem.truth_inliers is None
+    colors = "Inliers and outliers are this run's." if by_run else "Right or wrong by the truth."
     joined = "Violet lines join the two arcs of one pair." if (bars.chosen & (bars.count > 1)).any() else ""
     return " ".join(filter(None, (story.note, arcs.rule, rule, colors, joined)))

@@ -117,6 +117,13 @@
       turn(by);
     }
   }, true);
+  // The last card asks its reader to go on with the page: whoever does is done with it.
+  addEventListener("pointerdown", (event) => {
+    const last = card && index === told.moments.length - 1;
+    if (!last || !event.isTrusted || !(event.target instanceof Element) || event.target.closest(".introduction, canvas")) return;
+    remember();
+    close();
+  }, true);
   addEventListener("click", (event) => {
     if (!(event.target instanceof Element) || !event.target.closest(".introduce")) return;
     close();
