@@ -223,7 +223,7 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
         yield (
             f"A pose fitted without gravity has {one} within the bound, {two} within twice and {four} within four "
             f"times of it. Its vertical is {_deg(e.free.tilt_rad)} ± {_deg(e.free_tilt_sd_rad)} from the given "
-            f"gravity, which is said to be off by {_deg(e.aligned.gravity_bound_rad)} at most."
+            f"gravity, whose bound is {_deg(e.aligned.gravity_bound_rad)}."
         )
     yield from _proofs(trace, certificate)
     if truth is not None:

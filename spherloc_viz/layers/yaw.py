@@ -24,6 +24,8 @@ INNER, OUTER = 1.3, 1.95
 STEP_RAD = np.radians(4.0)
 FEWEST_TRACKS = 24
 """Least number of tracks of the band; it has more if more arcs are drawn over one yaw."""
+FEW_ARCS, WIDE_PX, NARROW_PX = 30, 5.0, 2.0
+"""Widths of the lines of few arcs, which would hardly be seen, and of many."""
 EXAMPLE_RAD = np.radians(15.0)
 """Preferred width of the arc that serves as an example."""
 RAYS_SEEN = 4.5
@@ -138,9 +140,7 @@ class StageArcs:
             others = np.flatnonzero(~self.in_clique)
         return np.concatenate([even(members, take), others[: room - take]])
 
-    def drawn(
-        self, view: RunView, arcs: IntArray, marked: np.ndarray, mark: style.RGB, width_px: float = 2.0
-    ) -> Segments:
+    def drawn(self, view: RunView, arcs: IntArray, marked: np.ndarray, mark: style.RGB, width_px: float) -> Segments:
         """Arcs on the ring around the middle of the map, the marked ones (mask) in their colour. Arcs that overlap lie
         side by side, so that the band is as broad as they are many."""
         order, arc, points = view.kept("arcs", arcs.tobytes(), lambda: self._band(view, arcs))
@@ -489,7 +489,7 @@ def _ring(
     heights = ring.by_degree(counts)
     line = ring.circle(view, view.middle, heights / max(1, int(heights.max())))
     mask = np.zeros(len(drawn), dtype=bool) if marked is None else marked
-    band = arcs.drawn(view, drawn, mask, mark)
+    band = arcs.drawn(view, drawn, mask, mark, WIDE_PX if len(drawn) <= FEW_ARCS else NARROW_PX)
     return band, ring.outline("ring/overlap", line, style.SPHERE), *ring.spokes(view, view.middle, None, yaws_rad)
 
 

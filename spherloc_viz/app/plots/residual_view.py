@@ -119,7 +119,7 @@ def _bound(histogram: Histogram, x: Scale) -> list[str]:
     words = f"bound {median}{unit}" + histogram.widened * " with gravity's error"
     if high - low > 1.0:
         parts.append(shapes.rect(low, TOP_PX, high - low, FOOT_PX - TOP_PX, shapes.fill(style.ESTIMATE, 0.15)))
-        words += f" ({least} to {most}{unit})"
+        words = f"median {words} ({least} to {most}{unit})"
     look = shapes.stroke(style.ESTIMATE, 1.5, ' stroke-dasharray="4 3"')
     parts.append(shapes.line(middle, TOP_PX - 4, middle, FOOT_PX, look))
     half = 0.5 * shapes.text_width_px(words)
