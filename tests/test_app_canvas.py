@@ -1,5 +1,6 @@
 """The picture of one page, on a real viser server and for a page without a browser."""
 
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -13,12 +14,13 @@ from spherloc.estimators import default_options, estimate
 from spherloc_viz.app.catalog import Run, RunRequest, SceneRequest
 from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.stage import canvas as stage
+from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.canvas import Canvas
 from spherloc_viz.app.stage.walls import Walls
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 from tests.connected_page import HELLO, ConnectedPage
-from tests.waiting import until
+from tests.waiting import LIMIT_S, until
 
 KEY = "a key of this test"
 
@@ -72,3 +74,33 @@ def test_a_page_that_arrives_late_sees_around_walls_that_came_meanwhile(
     until(lambda: len(placed("position")) == 2)
     walls = Walls(mesh, turn)
     assert walls.blocked(there, subject) > 0.5 and walls.blocked(placed("position")[1], subject) < 0.2
+
+
+def test_what_is_hidden_is_right_for_where_the_viewer_stands_at_last(
+    page: ConnectedPage, scene_of: Callable[..., SyntheticScene]
+) -> None:
+    """While a thread waits that heard of an earlier place, outside of the camera, the viewer comes to stand inside."""
+    problem = scene_of("panorama", correspondences=40, outlier_rate=0.3).problem()
+    request = RunRequest(SceneRequest("scene", 0), "mc", default_options("mc", problem))
+    run = Run(request, estimate(problem, "mc"), np.arange(len(problem)))
+    picture = paint(run.trace, len(steps(run.trace)) - 1)
+    shown = Canvas(
+        page.handle, DisplayControls(page.handle.gui, print), lambda *_: None, lambda _: None, lambda *_: None, 0
+    )
+    shown.draw(run, picture, None, False)
+    inside = views.find("From the camera", picture, 1.5)
+    outside = inside.position + np.array([0.0, -30.0, 0.0])
+
+    def stand(position: np.ndarray) -> None:
+        page.send(HELLO | {"position": position.tolist(), "look_at": inside.target.tolist()})
+        until(lambda: np.allclose(page.handle.camera.position, position, atol=1e-6))
+
+    stand(outside)
+    until(lambda: "cameras/estimate" not in shown._painter.hidden)
+    with shown._lock:  # all threads wait
+        waiting = threading.Thread(target=shown._make_room)
+        shown._painter.hidden = frozenset({"map/points"})  # so that it has something to do
+        waiting.start()
+        page.handle.camera._state.position = inside.position
+    waiting.join(LIMIT_S)
+    assert "cameras/estimate" in shown._painter.hidden and "map/points" not in shown._painter.hidden

@@ -4,6 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import viser
@@ -32,6 +33,16 @@ MOVE_S = 5.0
 """Upper limit of the time in which a slow page moves its viewer smoothly (``smooth.js``), while its panels dock."""
 RESHAPED = 0.02
 """Relative change of the canvas' aspect ratio, or of the width of its letters, from which on a view is fitted again."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Room:
+    """How a viewer sees a picture."""
+
+    hidden: frozenset[str]
+    """Names of the nodes that are hidden."""
+    seen_from: tuple[np.ndarray, bool]
+    """The viewer's position (3,), and whether it is inside a camera."""
 
 
 class Canvas:
@@ -160,22 +171,30 @@ class Canvas:
 
     def _make_room(self) -> None:
         """Hide what would cover the view of a viewer inside a camera; called on threads of viser and of the page."""
+        room = self._room()
+        # Does not wait, since the viewer moves often, for a picture that is being drawn.
+        if room is None or (room.hidden == self._painter.hidden and not self._painter.follows(*room.seen_from)):
+            return
+        with self._lock:
+            room = self._room()  # of where the viewer stands by now: a thread that began earlier may come later
+            if room is not None:
+                self._painter.hide(room.hidden)
+                self._painter.see_from(*room.seen_from)
+
+    def _room(self) -> "_Room | None":
+        """What a viewer where the page's viewer stands must not see; None if there is nothing to see, or if the page
+        has told no position."""
         picture = self._picture
         try:
             position = np.array(self._client.camera.position, dtype=np.float64).reshape(3)
         except (TypeError, ValueError):  # viser does not check what a page sends about its camera
-            return
+            return None
         if picture is None:
-            return
-        in_the_way = views.before_the_eyes(picture, position) | self._cut(picture, position)
+            return None
+        hidden = views.before_the_eyes(picture, position) | self._cut(picture, position)
         if self._looked is None or self._looked[0] != SPHERE:
-            in_the_way |= views.over_the_walk(picture, position)
-        in_camera = views.inside(picture, position)
-        # Does not wait, since the viewer moves often, for a picture that is being drawn.
-        if in_the_way != self._painter.hidden or self._painter.follows(position, in_camera):
-            with self._lock:
-                self._painter.hide(in_the_way)
-                self._painter.see_from(position, in_camera)
+            hidden |= views.over_the_walk(picture, position)
+        return _Room(hidden, (position, views.inside(picture, position)))
 
     def _cut(self, picture: Picture, position: np.ndarray) -> frozenset[str]:
         """Names of the labels that the canvas' edge would cut for a viewer at that position (3,)."""
