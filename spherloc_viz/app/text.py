@@ -37,11 +37,12 @@ def box(content: str, css: str = "") -> str:
     return f'<div class="words" style="padding:0 .8em .6em;font-size:13px;line-height:1.4;{css}">{content}</div>'
 
 
-def step_html(step: Step, caption_html: Callable[[str], str] = escape, end: str = "") -> str:
+def step_html(step: Step, caption_html: Callable[[str], str] = escape, end: str = "", place: str = "") -> str:
     """Title, caption, equation and note of a step; ``caption_html`` makes HTML of the words of caption and note.
-    ``end`` says that it is the "first" or the "last" one, so that the page's script can disable a button."""
+    ``end`` says that it is the "first" or the "last" one, so that the page's script can disable a button, and ``place``
+    is its number of how many, such as "7/37", which the large captions show."""
     parts = [
-        '<div class="step-title" style="font-size:15px;font-weight:600;padding-bottom:.25em">'
+        f'<div class="step-title" data-place="{place}" style="font-size:15px;font-weight:600;padding-bottom:.25em">'
         f"{escape(step.title)}</div>",
         f"<div>{caption_html(step.caption)}</div>",
     ]

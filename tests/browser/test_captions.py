@@ -7,6 +7,7 @@ from playground import SIZE, Playground
 from playwright.sync_api import Browser, expect
 
 TYPE_PX = "one => parseFloat(getComputedStyle(one).fontSize)"
+AFTER = "element => getComputedStyle(element, '::after').content"
 WIDTH_PX = "() => document.querySelector('[data-view]').closest(\"[style*='left: 0px']\").getBoundingClientRect().width"
 
 
@@ -26,6 +27,8 @@ def test_the_projector_view_says_each_step_in_large_type(browser: Browser, addre
     expect(tab.page.get_by_text("Residuals at the estimated pose")).to_be_visible()
     tab.page.keyboard.press("n")
     expect(captions).to_contain_text("Outcome")
+    count = tab.page.evaluate("() => document.querySelector('[data-place]').dataset.place.split('/')[1]")
+    assert captions.locator(".step-title").evaluate(AFTER) == f'"{count}/{count}"', "which step it is, of how many"
     box, room = captions.bounding_box(), tab.page.viewport_size
     assert box is not None and room is not None and box["y"] > 0 and box["y"] + box["height"] <= room["height"] + 1
 

@@ -102,9 +102,10 @@ class StepsPanel:
         if self._buttons.options != buttons:
             self._buttons.options = buttons
         end = "first" if self._index == 0 else "last" if self._index == len(self._steps) - 1 else ""
+        place = f"{self._index + 1}/{len(self._steps)}"
         texts = (
             (self._stages, stages_html(self._steps, self._index)),
-            (self._text, step_html(step, linked, end) + "".join(table_html(table) for table in tables)),
+            (self._text, step_html(step, linked, end, place) + "".join(table_html(table) for table in tables)),
         )
         for widget, html in texts:
             update_widget(widget, content=html)
