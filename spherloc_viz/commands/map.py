@@ -19,7 +19,7 @@ from typing import Any
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.errors import InputError, SpherlocError, StoppedError, reason, show
+from spherloc.errors import InputError, SpherlocError, StoppedError, reason, shorten, show
 from spherloc.files import is_folder, is_image, names_in
 from spherloc.frontend import trained
 from spherloc.frontend.features import FeatureOptions
@@ -213,6 +213,9 @@ def _take_frames(video: Path, count: int, folder: Path, tell: Tell) -> None:
         tell("frames taken from the video", len(taken), count)
 
     frames_of(video, folder, count, another)
+    others = [name for name in names_in(folder) if is_image(name) and name not in taken]
+    if others:
+        say(f"{folder}: has {len(others)} more images, such as {shorten(others[0])}, which are mapped with the frames.")
 
 
 def _compiled_for(new_images: Path | None) -> AbstractContextManager[None]:

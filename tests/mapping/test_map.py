@@ -45,7 +45,7 @@ from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by
 from spherloc.mapping.written import _gravity
 from spherloc.problem import Problem
 from spherloc_viz.commands.image_commands import map as map_command
-from spherloc_viz.commands.map import _kind, _sizes, cameras_of_file, how_of, main, scale_of_words
+from spherloc_viz.commands.map import _kind, _sizes, _take_frames, cameras_of_file, how_of, main, scale_of_words
 from spherloc_viz.commands.map_report import map_report, summary, words_at
 from tests.waiting import LIMIT_S
 
@@ -608,7 +608,7 @@ def test_a_full_disk_is_told_in_a_sentence_and_what_is_done_is_kept(walk, tmp_pa
     assert list((tmp_path / "map").glob("matches_*.db"))
 
 
-def test_frames_of_a_video_are_its_sharpest(tmp_path, rng):
+def test_frames_of_a_video_are_its_sharpest(tmp_path, rng, capsys):
     video = tmp_path / "walk.avi"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 10, (160, 80))
     if not writer.isOpened():
@@ -620,6 +620,9 @@ def test_frames_of_a_video_are_its_sharpest(tmp_path, rng):
     names = []
     assert frames_of(video, tmp_path, 3, names.append) == 3
     assert names == ["frame_000002.jpg", "frame_000006.jpg", "frame_000010.jpg"]
+    _take_frames(video, 1, tmp_path, lambda *_: None)
+    said = "has 2 more images, such as frame_000006.jpg, which are mapped with the frames."
+    assert said in capsys.readouterr().err, "one of the three is taken again"
     (tmp_path / "text.mp4").write_text("no video")
     with pytest.raises(InputError, match="cannot read it as a video"):
         frames_of(tmp_path / "text.mp4", tmp_path / "frames", 3, names.append)
