@@ -32,7 +32,7 @@ from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.layers.key_step import key_step
 from spherloc_viz.layers.outcome import early_table
 from spherloc_viz.layers.point_cloud import cloud_items, with_few_rays
-from spherloc_viz.layers.primitives import Label, Picture, SceneItem, Segments, Table
+from spherloc_viz.layers.primitives import Label, Picture, SceneItem, Segments, StepHeading, Table
 from spherloc_viz.layers.scale_bar import scale_bar
 from spherloc_viz.layers.selection import with_selection
 from spherloc_viz.layers.where_taken import where_taken
@@ -203,13 +203,7 @@ class RunDisplay:
         run = self._untold(run, withheld)
         trace = run.trace
         timeline = steps(trace, told)
-        at_hand = self._shown[2].step.stage if self._shown is not None else ""
-        balls = controls.display.wanted_view == "Balls" and at_hand != "Translation"
-        if balls and any(step.key == CLIQUE_STEP for step in timeline):
-            self.panels.steps.go(CLIQUE_STEP)
-        if self._opens_photographs(run):
-            self.panels.steps.begin_at(timeline[-1].key)
-        index, pause = self.panels.steps.advance(timeline, asked)
+        index, pause = self._advance(run, timeline, asked)
         picture, last = paint(trace, index, told), index == len(timeline) - 1
         diagnosis = None if hidden else diagnosis
         alternative = None if diagnosis is None else diagnosis.alternative_cam_from_map
@@ -217,19 +211,9 @@ class RunDisplay:
             picture = with_alternative(picture, trace, alternative)
         if last and self._scene_of(run.request.scene.scene) is not None:
             picture = with_few_rays(picture, int(np.count_nonzero(trace.inlier_mask)))
-        drawn = with_selection(picture, trace, selected)
-        beside = controls.items(known, hidden)
-        names = {item.name for item in beside if isinstance(item, Label) and item.layer == "trajectory"}
-        # Where queries are named, the name of the ellipsoid would lie over that of the one at hand.
-        left_out = {"uncertainty/sigmas"} if names and drawn.step.stage in NAMED_AT else names
-        scene = drawn.scene + beside + self._cloud(run, drawn.step.stage)
-        if last and not names:
-            scene += self._query_name(run, drawn)
-        drawn = replace(drawn, scene=tuple(item for item in scene if item.name not in left_out))
-        walk = walk_at_end(drawn) if last else None
-        if walk is not None:
-            box = np.stack([walk.min(axis=0), walk.max(axis=0)])
-            drawn = replace(drawn, scene=(*drawn.scene, *scale_bar("walk", box, run.trace.problem.metric)))
+        drawn = self._with_surroundings(
+            with_selection(picture, trace, selected), run, controls.items(known, hidden), last
+        )
         self._shown = known, mesh, drawn
         with self._client.atomic():
             self._follow_theme()
@@ -257,6 +241,31 @@ class RunDisplay:
             partial(self._paint_ahead, run, other, selected, told) for other in nearest[1 : 1 + MAX_AHEAD]
         )
         return self.canvas.check() if pause is None else pause
+
+    def _advance(self, run: Run, timeline: tuple[StepHeading, ...], asked: bool) -> tuple[int, float | None]:
+        """The number of the step to show, and seconds to the next one if they play."""
+        at_hand = self._shown[2].step.stage if self._shown is not None else ""
+        balls = self.controls.display.wanted_view == "Balls" and at_hand != "Translation"
+        if balls and any(step.key == CLIQUE_STEP for step in timeline):
+            self.panels.steps.go(CLIQUE_STEP)
+        if self._opens_photographs(run):
+            self.panels.steps.begin_at(timeline[-1].key)
+        return self.panels.steps.advance(timeline, asked)
+
+    def _with_surroundings(self, picture: Picture, run: Run, beside: tuple[SceneItem, ...], last: bool) -> Picture:
+        """The picture of a step, which may be the ``last``, with what is ``beside`` the run and with its map."""
+        names = {item.name for item in beside if isinstance(item, Label) and item.layer == "trajectory"}
+        # Where queries are named, the name of the ellipsoid would lie over that of the one at hand.
+        left_out = {"uncertainty/sigmas"} if names and picture.step.stage in NAMED_AT else names
+        scene = picture.scene + beside + self._cloud(run, picture.step.stage)
+        if last and not names:
+            scene += self._query_name(run, picture)
+        picture = replace(picture, scene=tuple(item for item in scene if item.name not in left_out))
+        walk = walk_at_end(picture) if last else None
+        if walk is None:
+            return picture
+        box = np.stack([walk.min(axis=0), walk.max(axis=0)])
+        return replace(picture, scene=(*picture.scene, *scale_bar("walk", box, run.trace.problem.metric)))
 
     def prepare(self) -> bool:
         """Paint one of the steps that may be asked for next; false if there is none that is not painted."""
