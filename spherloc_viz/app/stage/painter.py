@@ -5,7 +5,7 @@ Colours arrive on the screen as the legend shows them.
 
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -34,8 +34,17 @@ _LINEAR = np.where(_SRGB <= 0.04045, _SRGB / 12.92, ((_SRGB + 0.055) / 1.055) **
 
 
 def light_bytes(colors: ByteArray) -> ByteArray:
-    """Linear bytes (..., 3) for lines and batched meshes that show the sRGB bytes ``colors`` (..., 3)."""
-    return _bytes(_before_filmic(colors))
+    """Linear bytes (..., 3), to be read only, for lines and batched meshes that show the sRGB bytes ``colors``
+    (..., 3)."""
+    return _light(colors.tobytes()).reshape(colors.shape)
+
+
+@lru_cache(maxsize=64)
+def _light(colors: bytes) -> ByteArray:
+    """The same (K, 3) for the bytes of K colours, kept: most items have the colours of the run before."""
+    light = _bytes(_before_filmic(np.frombuffer(colors, np.uint8).reshape(-1, 3)))
+    light.flags.writeable = False
+    return light
 
 
 def surface_bytes(colors: ByteArray) -> ByteArray:
@@ -187,8 +196,11 @@ class Painter:
     def follows(self, eye: np.ndarray, in_camera: bool) -> bool:
         """Whether ``see_from`` would change anything; needs no lock."""
         before = self._seen_from
-        moved = before is not None and before[1] != in_camera
-        return moved or any(_resized(handle, item, (eye, in_camera)) for handle, item in self._dots)
+        if before is not None and before[1] == in_camera and np.array_equal(before[0], eye):
+            return False
+        return (before is not None and before[1] != in_camera) or any(
+            _resized(handle, item, (eye, in_camera)) for handle, item in self._dots
+        )
 
     def see_from(self, eye: np.ndarray, in_camera: bool) -> None:
         """Limit the size of dots on the screen for a viewer at ``eye`` (3,), who may be inside a camera: then the map's
