@@ -8,7 +8,7 @@
 (() => {
   const EVERY_MS = 150, FOLDED_MS = 2000, NARROW_PX = 600, ROOMY_PX = 1000, FOLD = "Collapse panel area", UNFOLD = "Expand column";
   const DESELECT = '<button class="deselect" data-touch="deselect:">Deselect</button>';
-  let bar = null, words = null, projector = false, folded = false, roomMade = false, foldedHere = false;
+  let bar = null, words = null, number = null, projector = false, folded = false, roomMade = false, foldedHere = false;
   let toldWidth = 0, toldWindow = 0, toggledAt = -Infinity;
 
   // While the settings are unfolded on a narrow screen, they take the place of the captions.
@@ -50,7 +50,9 @@
     );
     const close = button("Close (L)", "Close the projector view", toggle);
     close.className = "close";
-    row.append(close);
+    number = document.createElement("span");
+    number.className = "place";
+    row.append(number, close);
     bar.append(words, row);
     document.body.append(bar);
   }
@@ -64,6 +66,7 @@
       .map(([kind, html]) => `<div class="of-${kind.slice(1)}">${html}${kind === ".match-words" ? DESELECT : ""}</div>`)
       .join("");
     if (words.dataset.told === told) return;
+    number.textContent = document.querySelector(".step-title")?.dataset.place ?? "";
     const match = (html) => html?.split("<div class=\"of-step-words\">")[0];
     const walked = match(words.dataset.told) === match(told);
     words.dataset.told = told;
