@@ -7,7 +7,8 @@ from playground import SIZE, Playground
 from playwright.sync_api import Browser, expect
 
 TYPE_PX = "one => parseFloat(getComputedStyle(one).fontSize)"
-HEIGHT_PX = "() => document.querySelector('[data-view]').closest(\"[style*='min-height: 50px']\").getBoundingClientRect().height"
+PART = "[style*='min-height: 50px']"
+HEIGHT_PX = f"() => document.querySelector('[data-view]').closest(\"{PART}\").getBoundingClientRect().height"
 WIDTH_PX = "() => document.querySelector('[data-view]').closest(\"[style*='left: 0px']\").getBoundingClientRect().width"
 
 
