@@ -52,6 +52,8 @@ def _shown(table: Mapping[str, Any], key: str) -> str:
 
 FORMAT = 1
 MAX_BYTES = 1_000_000
+DIGITS = 6
+"""Decimals of a pose that count: of a rotation, and of metres."""
 _KINDS = {"scene": str, "scene_sha256": str, "name": str, "estimator": str, "seed": int, "queries": int}
 _UNCOMPARED = {"scene"}
 """Keys that may differ: a scene file that was moved or copied is still the same scene."""
@@ -64,7 +66,7 @@ class Configuration:
     scene: str
     """Path of the scene file."""
     scene_sha256: str
-    """Hash of its content."""
+    """Hash of its content and of the poses of its references, which change with the map."""
     name: str
     """The scene's name."""
     estimator: str
@@ -105,7 +107,7 @@ class Configuration:
         """The differences to ``now``, as phrases such as "seed is 1, was 0"."""
         found = differences(_plain(self), _plain(now), _UNCOMPARED)
         # Options of two different estimators cannot be compared.
-        told = found | ({"scene_sha256": "the scene file is another one"} if "scene_sha256" in found else {})
+        told = found | ({"scene_sha256": "the scene file or its map is another one"} if "scene_sha256" in found else {})
         return [said for key, said in told.items() if "estimator" not in found or not key.startswith("options.")]
 
 
@@ -122,7 +124,7 @@ def configuration_of(
         content = read_file(path, MAX_BYTES)
     return Configuration(
         scene=str(path),
-        scene_sha256=hashlib.sha256(content).hexdigest(),
+        scene_sha256=hashlib.sha256(content + _poses_of(scene)).hexdigest(),
         name=scene.name,
         estimator=estimator,
         options=asdict(options) | ({} if initialiser is None else {"initialise": initialiser}),
@@ -134,6 +136,12 @@ def configuration_of(
         registration_thresholds_m=None if scene.registration is None else tuple(scene.registration.thresholds_m),
         metric=scene.metric,
     )
+
+
+def _poses_of(scene: MapScene) -> bytes:
+    """The poses of the references, rounded, so that another processor finds the same."""
+    posed = [view.cam_from_map for view in scene.references if view.cam_from_map is not None]
+    return (np.round(np.array(posed, dtype=np.float64), DIGITS) + 0.0).tobytes()
 
 
 def read_configuration(path: Path) -> Configuration:

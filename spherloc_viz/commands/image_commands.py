@@ -242,7 +242,7 @@ def map(
     frames: int = 40,
     output: OptionalPath = None,
     camera_height: OptionalFloat = None,
-    distance: Annotated[tuple[str, str, float] | None, arg(metavar="IMAGE IMAGE METRES", help_behavior_hint="")] = None,
+    distance: Annotated[tuple[str, ...], arg(metavar="IMAGE IMAGE METRES", help_behavior_hint="")] = (),
     positions: OptionalPath = None,
     gravity: OptionalPath = None,
     camera_from_imu: OptionalRotation = None,
@@ -295,13 +295,14 @@ def map(
     from spherloc.datasets.query_gravity import camera_from_imu as rotation_of
     from spherloc.frontend.masks import Masks
     from spherloc.mapping.make import ScaleMeasurement
-    from spherloc_viz.commands.map import MAX_METRES, cameras_of_file, make
+    from spherloc_viz.commands.map import MAX_METRES, cameras_of_file, distance_of, make
 
-    if sum(one is not None for one in (camera_height, distance, positions)) > 1:
+    if sum(one is not None for one in (camera_height, distance or None, positions)) > 1:
         raise InputError("--camera-height, --distance and --positions all give the scale; keep one.")
+    apart = distance_of(distance)
     if panorama and camera is not None:
         raise InputError("--panorama needs no --camera; keep one of them.")
-    for flag, metres in (("--camera-height", camera_height), ("--distance", distance and distance[2])):
+    for flag, metres in (("--camera-height", camera_height), ("--distance", apart and apart[2])):
         if metres is not None and not 0.0 < metres < MAX_METRES:
             raise InputError(f"{flag} is {metres:g}; give a positive number of metres.")
     if not 2 <= frames <= 500:
@@ -312,7 +313,7 @@ def map(
     taken = None if video is None else (video, frames)
     masked = any(one is not None for one in (mask, nadir, seam))
     masks = Masks(mask, nadir or 0.0, seam or 0.0) if masked else None
-    measured = ScaleMeasurement(camera_height, distance)
+    measured = ScaleMeasurement(camera_height, apart)
     cameras = cameras_of_file(camera, camera_name)
     return make(
         folder,

@@ -12,13 +12,14 @@ import signal
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.datasets.scene_file import read_table
 from spherloc.errors import InputError, SpherlocError, StoppedError, reason, shorten, show
 from spherloc.files import is_folder, is_image, names_in
 from spherloc.frontend import trained
@@ -29,6 +30,8 @@ from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.images import check_image, read_size
 from spherloc.mapping.advice import advice, for_a_page
+from spherloc.mapping.kept_scale import FILE as SCALE_FILE
+from spherloc.mapping.kept_scale import keep_scale, kept_scale
 from spherloc.mapping.make import Map, ScaleMeasurement, make_map
 from spherloc.mapping.photographs import (
     CalibratedLens,
@@ -90,6 +93,10 @@ def make(
         found = photographs(folder, cameras, masks, panorama, _lens_finder(tell, folder, target, new_images))
         if positions is not None:
             measured = ScaleMeasurement(positions=read_positions(positions, found.views))
+        elif measured == ScaleMeasurement():
+            measured = kept_scale(target)
+            if measured != ScaleMeasurement():
+                say(f"The scale is as it was given before; to make the map without it, remove {target / SCALE_FILE}.")
         stated = None if gravity is None else read_stated_gravity(*gravity, found.views)
         for remark in (*found.remarks, *(() if stated is None else stated.remarks)):
             say(remark)
@@ -107,7 +114,7 @@ def make(
             raise
     report = target / REPORT
     try:
-        _write(report, made, found)
+        _write(report, made, found, measured)
     except OSError as error:
         raise StoppedError(_unwritten(report, error)) from None
     print("\n".join(summary(made, found)))
@@ -116,6 +123,8 @@ def make(
         print(f"lens          {target / LENS}, for other images of that camera: --camera {target / LENS}")
     if others is not None:
         print(f"new images    {_sizes(others)}")
+    if older := _of_the_map_before(target, made):
+        print(f"out of date   {', '.join(older)}: of the map before; give their images with --localize again")
     scene = made.written.new_scene or made.written.scene
     print(f"see it        spherloc play {scene}")
     print(f"localize      spherloc localize {scene}")
@@ -152,10 +161,27 @@ def _has_size(path: Path, size: tuple[int, int]) -> bool:
         return False
 
 
-def _write(report: Path, made: Map, found: Photographs) -> None:
-    """Write the report of a map, and the calibrations that its images told beside it; raises ``OSError``."""
+def _write(report: Path, made: Map, found: Photographs, measured: ScaleMeasurement) -> None:
+    """Write the report of a map, and beside it the calibrations that its images told and what gave its scale; raises
+    ``OSError``."""
     report.write_text(map_report(made, found), encoding="utf-8")
     write_lenses(report.parent, found.calibrated)
+    keep_scale(report.parent, measured)
+
+
+def _of_the_map_before(folder: Path, made: Map) -> list[str]:
+    """Scene files of other images in the folder of a map that were written for an earlier map in it."""
+    now = read_table(made.written.scene).get("about")
+    older = []
+    for name in names_in(folder):
+        path = folder / name
+        if path.suffix != ".toml" or path in (made.written.scene, made.written.new_scene):
+            continue
+        with suppress(InputError):
+            table = read_table(path)
+            if "map" in table and table.get("about") != now:
+                older.append(name)
+    return older
 
 
 def _unwritten(report: Path, error: OSError) -> str:
@@ -257,6 +283,20 @@ def _kind(views: Sequence[View]) -> str:
     return f"panoramas of {size}" if isinstance(camera, Equirectangular) else f"images of {size}, {camera.model}"
 
 
+def distance_of(words: Sequence[str]) -> tuple[str, str, float] | None:
+    """The two images and metres of the option ``--distance``; None without it. Raises ``InputError``."""
+    if not words:
+        return None
+    try:
+        first, second, metres = words
+        return first, second, float(metres)
+    except ValueError:
+        raise InputError(
+            f"--distance is {show(' '.join(words))}; give two images and the metres between them, after the folder, "
+            "such as --distance 1.jpg 5.jpg 12.5."
+        ) from None
+
+
 def scale_of_words(words: str) -> ScaleMeasurement:
     """The measurement in a line: the height of the cameras in metres, or the names of two images (in quotes, if they
     have spaces) and their distance; none if it is empty. Raises ``InputError`` for anything else."""
@@ -285,8 +325,10 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
         try:
             found = photographs(folder, {}, find_lens=_lens_finder(_progress, folder, output, None))
             measured = scale_of_words(scale)
+            if measured == ScaleMeasurement():
+                measured = kept_scale(output)
             made = make_map(found.views, folder, output, measured, None, _progress, how=how_of())
-            _write(report, made, found)
+            _write(report, made, found, measured)
         except SpherlocError as error:
             _tell({"error": str(error)})
             return 1

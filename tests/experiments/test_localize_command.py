@@ -220,7 +220,7 @@ def test_wrong_words_are_one_sentence(tmp_path: Path) -> None:
             run(path, out, **changes)
         assert said in str(error.value)
     scene.write_text(scene.read_text() + "# edited\n")
-    with pytest.raises(SpherlocError, match=r"\(the scene file is another one\)"):
+    with pytest.raises(SpherlocError, match=r"\(the scene file or its map is another one\)"):
         run(scene, out)
     assert len(table(out)) == 2
 

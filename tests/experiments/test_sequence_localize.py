@@ -157,7 +157,7 @@ def test_a_bug_in_a_matcher_is_not_hidden(tmp_path: Path) -> None:
 
 def sequence_of(count: int):
     """As much of a scene as choosing queries asks for."""
-    views = tuple(SimpleNamespace(name=f"image{place}.png") for place in range(count))
+    views = tuple(SimpleNamespace(name=f"image{place}.png", cam_from_map=None) for place in range(count))
     return MapScene("walk", "walk.toml", views, views[:1], None, np.array([0.0, 0.0, -1.0]))  # pyright: ignore
 
 

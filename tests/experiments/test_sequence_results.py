@@ -206,7 +206,7 @@ def test_damage_elsewhere_is_said_and_nothing_is_overwritten(tmp_path: Path) -> 
     ("change", "said"),
     [
         ({"seed": 1}, "(seed is 1, was 0)"),
-        ({"scene_sha256": "1" * 64}, "(the scene file is another one)"),
+        ({"scene_sha256": "1" * 64}, "(the scene file or its map is another one)"),
         ({"options": {"bound_px": 4.0}}, "(options.bound_px is 4.0, was 3.0; options.gravity_sd_deg is absent, was"),
         ({"estimator": "mc-exact", "options": {}}, "(estimator is 'mc-exact', was 'mc')"),
         ({"versions": {"spherloc": "1.1", "numpy": "2.0"}}, "(versions.spherloc is '1.1', was '1.0')"),

@@ -45,7 +45,17 @@ from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by
 from spherloc.mapping.written import _gravity
 from spherloc.problem import Problem
 from spherloc_viz.commands.image_commands import map as map_command
-from spherloc_viz.commands.map import _kind, _sizes, _take_frames, cameras_of_file, how_of, main, scale_of_words
+from spherloc_viz.commands.map import (
+    _kind,
+    _of_the_map_before,
+    _sizes,
+    _take_frames,
+    cameras_of_file,
+    distance_of,
+    how_of,
+    main,
+    scale_of_words,
+)
 from spherloc_viz.commands.map_report import map_report, summary, words_at
 from tests.waiting import LIMIT_S
 
@@ -747,6 +757,26 @@ def test_new_images_are_counted_by_their_size(tmp_path, rng):
         new_images_of(new, mapped)
     with pytest.raises(InputError, match="empty: has no images; give a folder with images that are to be localized"):
         new_images_of(empty, mapped)
+
+
+def test_scenes_of_the_map_before_are_told(walk):
+    _, _, made, *_ = walk
+    folder = made.written.scene.parent
+    other, text = folder / "other.toml", made.written.new_scene.read_text()
+    other.write_text(text)
+    try:
+        assert _of_the_map_before(folder, made) == []
+        other.write_text(text.replace("points. Units are", "points, as yesterday. Units are"))
+        assert _of_the_map_before(folder, made) == ["other.toml"]
+    finally:
+        other.unlink()
+
+
+def test_a_distance_is_two_images_and_metres():
+    assert distance_of(()) is None and distance_of(("a.jpg", "b.jpg", "12.5")) == ("a.jpg", "b.jpg", 12.5)
+    for words in (("a.jpg", "b.jpg"), ("a.jpg", "b.jpg", "far"), ("a.jpg", "b.jpg", "3", "folder")):
+        with pytest.raises(InputError, match=r"--distance is '.*'; give two images and the metres between them"):
+            distance_of(words)
 
 
 def test_new_images_of_cameras_that_were_given(tmp_path, rng):

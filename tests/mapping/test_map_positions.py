@@ -10,6 +10,8 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError
 from spherloc.frontend.view import View
 from spherloc.geometry import so3_exp
+from spherloc.mapping.kept_scale import keep_scale, kept_scale
+from spherloc.mapping.make import ScaleMeasurement
 from spherloc.mapping.positions import Positions, gps_of_images, local_metres, overlaid, read_positions
 from spherloc.mapping.upright import Level, scale_by_positions
 
@@ -153,3 +155,31 @@ def test_gps_in_photographs(tmp_path):
     for name, place in local_metres(degrees).items():
         np.testing.assert_allclose(found.by_name[name], place, atol=0.01)
     assert gps_of_images(views[:3]) is None
+
+
+@pytest.mark.parametrize(
+    "measured",
+    [
+        ScaleMeasurement(),
+        ScaleMeasurement(camera_height_m=1.6),
+        ScaleMeasurement(distance=("a.jpg", "b c.jpg", 18.0)),
+        ScaleMeasurement(positions=Positions({"a.jpg": np.array([1.0, 2.5, -3.0])}, "the file p.txt", True)),
+    ],
+)
+def test_what_gave_a_map_its_scale_gives_it_again(tmp_path, measured):
+    keep_scale(tmp_path, ScaleMeasurement())
+    assert kept_scale(tmp_path) == ScaleMeasurement() and not list(tmp_path.iterdir())
+    keep_scale(tmp_path, measured)
+    found = kept_scale(tmp_path)
+    if measured.positions is None:
+        assert found == measured
+        return
+    assert found.positions is not None and found.positions.source == "the file p.txt" and found.positions.horizontal
+    np.testing.assert_array_equal(found.positions.by_name["a.jpg"], [1.0, 2.5, -3.0])
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"distance": ["a", "b"]}', '{"positions": {"a": [1, 2]}}'])
+def test_a_damaged_scale_is_a_sentence(tmp_path, text):
+    (tmp_path / "scale.json").write_text(text)
+    with pytest.raises(InputError, match=r"scale\.json: cannot be read \(.*\); remove it, and give the scale again\.$"):
+        kept_scale(tmp_path)
