@@ -12,8 +12,9 @@ import ctypes
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -40,7 +41,7 @@ from spherloc.mapping.upright import Tell
 from spherloc.registry import require
 from spherloc.types import BoolArray, FloatArray
 
-DATABASE_VERSION = 6
+DATABASE_VERSION = 7
 """Number to be increased when pairs are matched or checked in another way, so that old databases are not used."""
 DATABASES = "matches_*.db*"
 """Pattern of the names of databases, with the files that SQLite puts beside them."""
@@ -88,26 +89,24 @@ def reconstruct(
     features = [extracted[index] for index in range(len(views))]
     usable = [_usable(view.camera, one.pixels) for view, one in zip(views, features, strict=True)]
     path = folder / f"matches_{_key(views, how)}.db"
+    with _database(pycolmap, path) as database:
+        ids = _described(pycolmap, database, views, features, usable)
+        cameras = [view.camera for view in views]
+        promising = _pairs(features, NEIGHBOURS_LEARNED, ALIKE_LEARNED) if len(how.features.parts) > 1 else ()
+        compared = ImagePairs(pycolmap, cameras, features, usable, gravity, how.matching, frozenset(promising))
+        every = len(views) <= MAX_EXHAUSTIVE
+        pairs = list(combinations(range(len(views)), 2)) if every else _pairs(features, NEIGHBOURS, ALIKE)
+        found, at_one_place, one_thing = _matched(database, ids, compared, pairs, tell)
+    whole = path.with_name(f"{path.stem}_whole.db")
     try:
-        database = pycolmap.Database.open(str(path))
-    except Exception as error:  # pycolmap passes on whatever SQLite raises
-        raise InputError(f"{path}: cannot be written ({reason(error)}); {advice('other folder')}.") from None
-    try:
-        try:
-            ids = _described(pycolmap, database, views, features, usable)
-            cameras = [view.camera for view in views]
-            promising = _pairs(features, NEIGHBOURS_LEARNED, ALIKE_LEARNED) if len(how.features.parts) > 1 else ()
-            compared = ImagePairs(pycolmap, cameras, features, usable, gravity, how.matching, frozenset(promising))
-            every = len(views) <= MAX_EXHAUSTIVE
-            pairs = list(combinations(range(len(views)), 2)) if every else _pairs(features, NEIGHBOURS, ALIKE)
-            counts, same_place, one_thing = _matched(database, ids, compared, pairs, tell)
-        finally:
-            database.close()
-    except RuntimeError as error:
-        if "SQLite" not in str(error):
-            raise
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(database))  # to delete what cannot be closed aborts the process
-        raise StoppedError(f"{path}: cannot be written ({reason(error)}); {advice('go on')}.") from None
+        for left in folder.glob(f"{whole.name}-*"):  # of a run that was killed
+            left.unlink()
+        shutil.copyfile(path, whole)  # else what follows would be found already when the map is made again
+    except OSError as error:
+        raise StoppedError(f"{whole}: cannot be written ({reason(error)}); {advice('go on')}.") from None
+    with _database(pycolmap, whole) as database:
+        found = _with_images_between(database, ids, compared, found, at_one_place, tell)
+    counts, same_place = _counts(_agreeing(found), len(views)), _counts(at_one_place, len(views))
     if counts.max(initial=0) < MIN_MATCHES:
         if same_place.max(initial=0) >= MIN_MATCHES:
             raise InputError(
@@ -127,7 +126,7 @@ def reconstruct(
             "closer to each other, half a metre to two metres apart indoors."
         )
     names = [view.name for view in views]
-    made = [_models_of(pycolmap, path, names, ids, counts, same_place, keep, tell) for keep in (0.0, STRONG)]
+    made = [_models_of(pycolmap, whole, names, ids, counts, same_place, keep, tell) for keep in (0.0, STRONG)]
     candidates = [one for one in made if one]
     if not candidates:
         raise InputError(
@@ -168,6 +167,28 @@ def _models_of(
         whole = Reconstruction(model, poses, counts, (), counts + same_place, path, number_of)
         found += parted(whole.judged())
     return untangled(found)
+
+
+@contextmanager
+def _database(pycolmap: Any, path: Path) -> Iterator[Any]:
+    """COLMAP's database in a file, which is made if it is not there.
+
+    Raises ``InputError`` if it cannot be opened, and ``StoppedError`` if there is no room to write.
+    """
+    try:
+        database = pycolmap.Database.open(str(path))
+    except Exception as error:  # pycolmap passes on whatever SQLite raises
+        raise InputError(f"{path}: cannot be written ({reason(error)}); {advice('other folder')}.") from None
+    try:
+        try:
+            yield database
+        finally:
+            database.close()
+    except RuntimeError as error:
+        if "SQLite" not in str(error):
+            raise
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(database))  # to delete what cannot be closed aborts the process
+        raise StoppedError(f"{path}: cannot be written ({reason(error)}); {advice('go on')}.") from None
 
 
 def _key(views: Sequence[View], how: FrontendOptions) -> str:
@@ -234,11 +255,11 @@ def _camera_in(pycolmap: Any, database: Any, camera: Camera) -> tuple[int, int]:
 
 def _matched(
     database: Any, ids: Sequence[int], compared: ImagePairs, waiting: Sequence[Pair], tell: Tell
-) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[Pair, int]]:
-    """Numbers of matches (V, V) of each pair that fit a relative pose, the same of pairs taken from one place, and that
-    of pairs that may show one thing at two places, which are not counted before.
+) -> tuple[dict[Pair, Any], dict[Pair, Any], dict[Pair, int]]:
+    """The geometry of pairs whose rotations agree, that of pairs taken from one place, and the numbers of matches of
+    pairs that may show one thing at two places, which are in neither.
 
-    The matches are written into the database. Pairs whose rotation disagrees with others have none.
+    The matches are written into the database.
     """
     found: dict[Pair, Any] = {}
     todo = [pair for pair in waiting if not database.exists_matches(*_of(ids, pair))]
@@ -259,7 +280,20 @@ def _matched(
         for pair, geometry in found.items()
         if compared.on_one_thing(*pair, database.read_matches(*_of(ids, pair)), geometry)
     }
-    found = _agreeing({pair: geometry for pair, geometry in found.items() if pair not in one_thing})
+    return _agreeing({pair: found[pair] for pair in found if pair not in one_thing}), same_place, one_thing
+
+
+def _with_images_between(
+    database: Any,
+    ids: Sequence[int],
+    compared: ImagePairs,
+    agreed: Mapping[Pair, Any],
+    same_place: Collection[Pair],
+    tell: Tell,
+) -> dict[Pair, Any]:
+    """The geometry of pairs, and that of more of them by an image between the two, which is written into the
+    database."""
+    found = dict(agreed)
     known = {pair: relative(geometry) for pair, geometry in found.items()}
     between = {pair: middles for pair, middles in open_triangles(known).items() if pair not in same_place}
 
@@ -278,7 +312,7 @@ def _matched(
             if database.exists_two_view_geometry(*_of(ids, pair)):
                 database.delete_two_view_geometry(*_of(ids, pair))
             database.write_two_view_geometry(*_of(ids, pair), geometry)
-    return _counts(_agreeing(found), len(ids)), _counts(same_place, len(ids)), one_thing
+    return found
 
 
 def _agreeing(found: Mapping[Pair, Any]) -> dict[Pair, Any]:

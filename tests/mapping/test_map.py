@@ -233,6 +233,9 @@ def test_what_is_done_is_not_done_again(walk):
     repeated = again()
     assert not any(what[0] == "pairs of images matched" for what in told)
     assert repeated.written.poses.keys() == made.written.poses.keys()
+    assert len(repeated.written.points) == len(made.written.points)
+    for name, pose in made.written.poses.items():
+        np.testing.assert_allclose(repeated.written.poses[name], pose, atol=1e-9)
 
 
 def test_the_report_says_what_is_in_the_map(walk):
@@ -583,7 +586,7 @@ def test_a_stopped_map_goes_on(tmp_path, rng):
     stopped_at("images searched for features")
     assert not (tmp_path / "map").exists()
     stopped_at("pairs of images matched")
-    (path,) = (tmp_path / "map").glob("matches_*.db")
+    (path,) = (tmp_path / "map").glob("matches_*.db")  # the other one is made when all pairs are done
     pycolmap = registry.require("pycolmap", "colmap", "making a map")
     with pycolmap.Database.open(str(path)) as database:
         database.clear_keypoints()
