@@ -356,7 +356,7 @@ def test_a_word_that_is_no_command_is_told_what_to_do(tmp_path: Path) -> None:
 
 def test_runs_of_a_results_folder_are_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The recordings of a sequence lie in a folder of its results; the list above says so."""
-    results = tmp_path / "recordings" / "street_mc_0"
+    results = tmp_path / "recordings" / "street_auto_0"
     spherloc_here("run", SCENE, "--recordings", str(results / "recordings"), cwd=tmp_path)
     capsys.readouterr()
     print_runs(results, RunQuery(), None, None, "table")

@@ -3,9 +3,11 @@
 import contextlib
 import csv
 import io
+import itertools
 import json
 import math
 import os
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -195,17 +197,17 @@ def _damaged(place: str, what: str) -> InputError:
     return InputError(f"{place}: {what}, so the file is damaged; delete that line to have its query done again.")
 
 
-def csv_text(rows: Iterable[QueryResult], gravity_map: FloatArray, header: bool = True) -> str:
+def csv_text(rows: Iterable[QueryResult], setting: Configuration, header: bool = True) -> str:
     """The rows as CSV, a line each: unknown values are empty, and no spreadsheet takes a cell for a formula.
 
-    ``gravity_map`` (3,) is the unit vector pointing down in the map.
+    Names of lengths end in "_m", or in "_units" if the units of the map are unknown.
     """
     file = io.StringIO(newline="")
     writer = csv.writer(file, lineterminator="\n")
     if header:
-        writer.writerow(COLUMNS)
+        writer.writerow(name if setting.metric else re.sub("_m$", "_units", name) for name in COLUMNS)
     for row in rows:
-        place = _place(row, gravity_map)
+        place = _place(row, setting.gravity_map)
         writer.writerow([_cell(place[name] if name in place else getattr(row, name)) for name in COLUMNS])
     return file.getvalue()
 
@@ -325,6 +327,19 @@ def _read_rows(path: Path) -> tuple[tuple[QueryResult, ...], int]:
     return tuple(sorted(rows.values(), key=lambda row: row.index)), len(whole)
 
 
+def folder_for(base: Path, configuration: Configuration) -> Path:
+    """``base``, or if it holds results of another configuration, the first of ``base``_2, ``base``_3, ... without any.
+
+    Raises ``InputError`` if a configuration there is damaged.
+    """
+    for number in itertools.count(1):
+        folder = base if number == 1 else base.with_name(f"{base.name}_{number}")
+        path = folder / CONFIGURATION
+        if not os.path.lexists(path) or not read_configuration(path).differences(configuration):
+            return folder
+    raise AssertionError
+
+
 class ResultsLog:
     """Appends rows to the results in a folder. Use it as a context manager; one process at a time may have it."""
 
@@ -368,7 +383,7 @@ class ResultsLog:
             os.fsync(file.fileno())
         self.rows[row.query] = row
         with self._writing(TABLE), (self.folder / TABLE).open("a", encoding="utf-8", newline="") as table:
-            table.write(csv_text([row], self.configuration.gravity_map, header=False))
+            table.write(csv_text([row], self.configuration, header=False))
 
     def forget_failures(self) -> int:
         """Remove the rows of queries without a pose, so that they are done again; returns how many.
@@ -450,4 +465,4 @@ class ResultsLog:
 
     def _write_table(self) -> None:
         ordered = sorted(self.rows.values(), key=lambda row: row.index)
-        self.write(TABLE, csv_text(ordered, self.configuration.gravity_map).encode())
+        self.write(TABLE, csv_text(ordered, self.configuration).encode())

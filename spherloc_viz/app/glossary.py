@@ -40,6 +40,10 @@ TERMS: dict[str, str] = {
     "NFA": "Number of false alarms: how many sets of so many wrong matches are expected to agree with some pose by "
     "chance. Far below 1, the matches do not agree by chance; near 1 or above, nobody can know the pose.",
     "covariance": "How sure the pose is by its inliers: drawn as an ellipsoid of three standard deviations.",
+    "expected error": "How far the pose may be off (RMS) by the noise of its inliers. An error of the map, of the lens "
+    "or of the matches' choice adds to it, and is not in it.",
+    "degenerate geometry": "The inliers leave the pose open, in part or altogether: they lie in one direction, or far "
+    "away, or too few are left.",
     "alternative pose": "Another pose that is worth a look: one that explains about as many matches, or the right one "
     "where the truth is known.",
     "estimator": "A method that computes the pose from all matches, most of them wrong. mc-exact can prove its answer, "

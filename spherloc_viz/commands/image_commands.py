@@ -22,6 +22,7 @@ from spherloc_viz.commands.flags import (
     OptionalText,
     Settings,
 )
+from spherloc_viz.importing import importing
 
 
 def localize(
@@ -64,15 +65,15 @@ def localize(
     Args:
         scenes: Scene files (TOML) with query and reference images, or names of bundled scenes; spherloc scenes lists
             them and the kinds.
-        estimator: mc (deterministic maximum consensus) if not given, mc-exact or another one, with options after
-            commas; a wrong name lists them all. Give it once for each.
+        estimator: auto (chooses between proving and sampling) if not given, mc (deterministic maximum consensus),
+            mc-exact or another one, with options after commas; a wrong name lists them all. Give it once for each.
         initialise: Estimator that solves the first query, and each one that the other one does not localize or that
             follows such a one; the other one tracks in between.
         seed: Seed of the estimator, the same for every query.
         option: Options of all estimators, such as bound_px=4; none and inf are values where they make sense.
         queries: Only these: names, or places counted from 0, the last one not included; all if not given.
-        output: Folder of the results; recordings/SCENE_ESTIMATOR_SEED if not given, or recordings/comparison_SEED; the
-            scene files of maps are called after their folders.
+        output: Folder of the results; recordings/SCENE_ESTIMATOR_SEED if not given, with a number if that holds others,
+            or recordings/comparison_SEED; the scene files of maps are called after their folders.
         record: Write a recording of each query.
         recordings: Folder of the recordings; a folder of that name in the output folder if not given.
         keep_gigabytes: Size limit of the recordings, GB (2, or their present size if larger). Above it the oldest
@@ -89,16 +90,17 @@ def localize(
     from spherloc_viz.commands.localize import Solving, compare_sequences, localize_sequence
     from spherloc_viz.commands.run import Records
 
-    def solving(name: str, folder: Path) -> Solving:
+    def solving(name: str, folder: Path, *, numbered: bool = False) -> Solving:
         kept = Records(recordings or folder / "recordings", keep_gigabytes=keep_gigabytes) if record else None
-        return Solving(*_name_and_options(name, option), folder, kept, initialise)
+        return Solving(*_name_and_options(name, option), folder, kept, initialise, numbered)
 
-    names = estimator or ("mc",)
+    names = estimator or ("auto",)
     try:
         if len(paths) == len(names) == 1:
             words = names[0] if initialise is None else f"{initialise}+{names[0]}"
             folder = output or RECORDINGS / f"{_results_name(paths[0])}_{words}_{seed}"
-            return localize_sequence(paths[0], [solving(names[0], folder)], seed, queries, retry_failed)
+            one = solving(names[0], folder, numbered=output is None)
+            return localize_sequence(paths[0], [one], seed, queries, retry_failed)
         base = output or RECORDINGS / f"comparison_{seed}"
         each = {path: [solving(name, base / _results_name(path) / name) for name in names] for path in paths}
         return compare_sequences(each, seed, queries, retry_failed, base)
@@ -251,12 +253,14 @@ def map(
     seam: OptionalFloat = None,
     features: Annotated[str | None, arg(metavar="sift|aliked|sift+aliked")] = None,
     localize: OptionalPath = None,
+    play: Flag = False,
 ) -> int:
     """Make a map of your own photographs: panoramas, or images of fisheyes and other wide cameras.
 
     Features, matches, COLMAP's structure from motion, which way is down, and scale if you give one; then a scene file
     that opens at once. Needs the extra colmap. Stop it when you like: the same command goes on. Ends with 0 if all
-    images are in the map, 1 if some are not (report.html says why), 2 if an input is wrong.
+    images are in the map and all of --localize are localized, 1 if some are not (report.html says why an image is not
+    in the map), 2 if an input is wrong.
 
     For example:
 
@@ -264,7 +268,9 @@ def map(
 
     spherloc map my_fisheyes --camera calibration.yaml --camera-height 1.6
 
-    spherloc map frames --video walk.mp4 --localize new_photographs
+    spherloc map frames --video walk.mp4
+
+    spherloc map my_panoramas --localize new_photographs --play
 
     Args:
         folder: Folder of the photographs, or of a folder for each camera; with --video, where its frames are put.
@@ -288,7 +294,9 @@ def map(
         seam: Leave out so many degrees on both sides of the seam between the two lenses of a 360-degree camera.
         features: What is matched: sift, aliked with LightGlue (the extra learned), or both; without it, both if that
             extra is installed.
-        localize: Folder of other images of that camera; a scene is written that localizes them in the map.
+        localize: Folder of other images of that camera, which are localized in the map as by spherloc localize; a scene
+            is written that has them as queries.
+        play: Open the playground on it in the end.
     """
     import numpy as np
 
@@ -315,7 +323,7 @@ def map(
     masks = Masks(mask, nadir or 0.0, seam or 0.0) if masked else None
     measured = ScaleMeasurement(camera_height, apart)
     cameras = cameras_of_file(camera, camera_name)
-    return make(
+    made = make(
         folder,
         output,
         cameras,
@@ -329,3 +337,23 @@ def map(
         gravity=None if gravity is None else (gravity, turn),
         features=features,
     )
+    code = max([0 if made.whole else 1, *(_localize_by_default(scene) for scene in made.new_scenes)])
+    scene = next(iter(made.new_scenes), made.scene)
+    if play:
+        _play(scene)
+    else:
+        print(f"see it        spherloc play {scene}")
+    return code
+
+
+def _localize_by_default(scene: Path) -> int:
+    """``localize`` with all options left out, where that name is taken."""
+    return localize((scene,))
+
+
+def _play(scene: Path) -> None:
+    """Open the playground on a scene, as ``spherloc play`` does."""
+    with importing():
+        from spherloc_viz.app.server import serve
+
+    serve(scene, "127.0.0.1", 0, RECORDINGS)

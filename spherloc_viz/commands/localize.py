@@ -27,6 +27,7 @@ from spherloc.experiments.results import (
     QueryResult,
     ResultsLog,
     SequenceResults,
+    folder_for,
 )
 from spherloc.experiments.sequence import INITIALISED, How, chosen_queries, localize_by_each
 from spherloc.experiments.summary import (
@@ -45,6 +46,7 @@ from spherloc.frontend.view import View
 from spherloc.trace import Trace
 from spherloc.trajectory import write_tum
 from spherloc.warm_up import warm_up
+from spherloc_viz.commands.flags import RECORDINGS
 from spherloc_viz.commands.progress import prepare, progress, say
 from spherloc_viz.commands.run import Records, parse_settings, store_of
 from spherloc_viz.commands.sweep import text_of
@@ -73,6 +75,18 @@ class Solving:
     """Settings with which queries are recorded; None if they are not recorded."""
     initialise: str | None = None
     """Registered name of the estimator that solves the first query and those after a loss; None if there is none."""
+    numbered: bool = False
+    """Whether another folder is taken, with a number, if this one holds results of another configuration."""
+
+    def placed(self, configuration: Configuration) -> "Solving":
+        """The same with the folder that the results go to; raises ``InputError`` if a configuration is damaged."""
+        output, records = self.output, self.records
+        if not self.numbered or (folder := folder_for(output, configuration)) == output:
+            return self
+        say(f"{output}: holds results of another configuration; those of this one go to {folder}.")
+        if records is not None and records.folder == output / RECORDINGS:
+            records = replace(records, folder=folder / RECORDINGS)
+        return replace(self, output=folder, records=records)
 
     @property
     def label(self) -> str:
@@ -147,8 +161,12 @@ def localized(
         say(f"the true poses are those of {scene.truth_source}.")
     with ExitStack() as stack:
         logs: list[ResultsLog] = []
-        for item, how in zip(solvings, hows, strict=True):
-            setting = configuration_of(scene, path, how.estimator, how.options, seed, item.initialise)
+        settings = [
+            configuration_of(scene, path, how.estimator, how.options, seed, item.initialise)
+            for item, how in zip(solvings, hows, strict=True)
+        ]
+        solvings = [item.placed(setting) for item, setting in zip(solvings, settings, strict=True)]
+        for item, setting in zip(solvings, settings, strict=True):
             logs.append(stack.enter_context(ResultsLog(item.output, setting)))
         todo = [{view.name for view in _todo(scene, chosen, log, retry_failed)} for log in logs]
         wanted = [(view, [k for k, names in enumerate(todo) if view.name in names]) for view in chosen]
@@ -336,15 +354,19 @@ def _each(results: SequenceResults) -> Iterator[str]:
     posed = [row for row in results.rows if row.status in POSED]
     if len(posed) > MAX_EACH:
         return
+    told = False
     for row in posed:
         turned, moved = row.expected_rotation_error_deg, row.expected_translation_error_m
         off = ""
-        if turned is not None and moved is not None:
+        if row.status == LOCALIZED and turned is not None and moved is not None:
+            told = True
             off = f", expected error {turned:.2g} deg and {results.configuration.length(moved)}"
         at = ", ".join(f"{value:.2f}" for value in row.position_m)
         why = f" ({row.diagnosis})" if row.diagnosis not in (None, str(Cause.OK)) else ""
         agree = f"{row.inliers or 0:,} of {row.matches or 0:,} matches agree"
         yield f"{row.query}: {row.status}{why}, at ({at}), {agree}{off}"
+    if told:
+        yield "expected errors are what the noise of the matches leaves; errors of the map and of the lens add to them"
 
 
 def _trajectory_lines(error: TrajectoryError | None, setting: Configuration) -> Iterator[str]:

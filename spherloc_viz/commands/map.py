@@ -13,6 +13,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +54,8 @@ from spherloc_viz.commands.map_report import MAP_FEATURES, map_report, summary
 from spherloc_viz.commands.progress import progress, say
 
 REPORT = "report.html"
-ESTIMATOR = "mc"
-"""What localizes new images, unless another estimator is chosen."""
+ESTIMATOR = "auto"
+"""What localizes new images."""
 MAX_METRES = 1e6
 """Heights and distances are below this."""
 MAX_SIZES = 4
@@ -75,14 +76,14 @@ def make(
     positions: Path | None,
     gravity: tuple[Path, FloatArray | None] | None,
     features: str | None,
-) -> int:
-    """Make the map, and print the result and what to do next; returns 1 if not all images are in it.
+) -> "Finished":
+    """Make the map, and print the result; raises ``InputError``.
 
     ``cameras`` are those of the calibration file by name, ``video`` a file and a number of frames to take from it into
     ``folder``; with ``panorama``, images of 2 to 1 are panoramas in any case. With ``find_carried``, what moves with
     the camera below panoramas is left out, too. ``positions`` is a file of where the images were taken,
     ``gravity`` one of their gravity, with the rotation (3, 3) from the IMU to the camera if it is the log of an IMU,
-    and ``features`` one of ``MAP_FEATURES``, the best installed if None. Raises ``InputError``.
+    and ``features`` one of ``MAP_FEATURES``, the best installed if None.
     """
     end_without_a_trace()
     how = how_of(features)
@@ -125,12 +126,20 @@ def make(
         print(f"new images    {_sizes(others)}")
     if older := _of_the_map_before(target, made):
         print(f"out of date   {', '.join(older)}: of the map before; give their images with --localize again")
-    scene = made.written.new_scene or made.written.scene
-    print(f"see it        spherloc play {scene}")
-    print(f"localize      spherloc localize {scene}")
-    for group in made.groups if others is not None else ():
-        print(f"or there      spherloc localize {group.written.new_scene}")
-    return 0 if len(made.written.poses) == len(found.views) else 1
+    scenes = tuple(one.written.new_scene for one in (made, *made.groups) if one.written.new_scene is not None)
+    return Finished(made.written.scene, scenes, len(made.written.poses) == len(found.views))
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A map that is made and written."""
+
+    scene: Path
+    """Its scene file."""
+    new_scenes: tuple[Path, ...]
+    """Scene files of the new images, in the map and in those of images that could not be joined; none without them."""
+    whole: bool
+    """Whether all photographs are in the map."""
 
 
 def _lens_finder(tell: Tell, folder: Path, target: Path, new_images: Path | None) -> LensFinder:
@@ -144,7 +153,8 @@ def _lens_finder(tell: Tell, folder: Path, target: Path, new_images: Path | None
         path = lens_path(target, "" if place == folder else place.name)
         kept = kept_lens(path)
         if kept is not None and (kept.width, kept.height) == size:
-            return kept, f"The lens is that of {path}, which the photographs told; without this file they tell it anew."
+            how = "which the photographs told; that file says how surely, and without it they tell it anew"
+            return kept, f"The lens is that of {path}, {how}."
         more: list[Path] = []
         if new_images is not None and is_folder(new_images):
             new = [new_images / name for name in names_in(new_images) if is_image(name)]

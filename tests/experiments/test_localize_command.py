@@ -154,7 +154,8 @@ def test_a_full_disk_keeps_what_is_done(tmp_path: Path, drawn: dict[str, str]) -
 
     # Python would leave the first half of compiled modules behind.
     environment = drawn | {"PYTHONDONTWRITEBYTECODE": "1"}
-    process = command(scene, "--output", out, "--no-record", environment=environment, preexec_fn=limit)
+    words = (scene, "--output", out, "--estimator", "mc", "--no-record")
+    process = command(*words, environment=environment, preexec_fn=limit)
     output, errors = process.communicate(timeout=LIMIT_S)
     assert process.returncode == 2 and output == "", errors
     (sentence,) = errors.strip().splitlines()

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from spherloc.errors import InputError
 from spherloc.experiments import QueryResult, read_results
 from spherloc.experiments.configuration import Configuration, read_configuration
-from spherloc.experiments.results import COLUMNS, PLACE, ResultsLog, csv_text, json_line, row_of_json
+from spherloc.experiments.results import COLUMNS, PLACE, ResultsLog, csv_text, folder_for, json_line, row_of_json
 from spherloc.geometry import pose
 
 CONFIGURATION = Configuration(
@@ -106,7 +106,7 @@ def test_wrong_values_are_refused(change: dict) -> None:
 @settings(max_examples=60)
 @given(st.lists(rows(), max_size=4))
 def test_the_table_is_read_by_others_and_holds_no_formula(written: list[QueryResult]) -> None:
-    found = list(csv.reader(io.StringIO(csv_text(written, CONFIGURATION.gravity_map), newline="")))
+    found = list(csv.reader(io.StringIO(csv_text(written, CONFIGURATION), newline="")))
     assert tuple(found[0]) == COLUMNS and len(found) == len(written) + 1
     for cells, original in zip(found[1:], written, strict=True):
         for name, cell in zip(COLUMNS, cells, strict=True):
@@ -121,12 +121,20 @@ def test_the_table_is_read_by_others_and_holds_no_formula(written: list[QueryRes
                 text = " ".join(value) if isinstance(value, tuple) else value
                 assert cell.lstrip()[:1] not in ("=", "+", "-", "@") and cell.isprintable()
                 assert cell.removeprefix("'") == "".join(c if c.isprintable() else " " for c in text).removeprefix("'")
-    assert len(csv_text(written, CONFIGURATION.gravity_map).splitlines()) == len(written) + 1
+    assert len(csv_text(written, CONFIGURATION).splitlines()) == len(written) + 1
+
+
+def test_the_table_says_so_where_the_units_of_the_map_are_unknown() -> None:
+    names = csv_text([], replace(CONFIGURATION, metric=False)).strip().split(",")
+    assert {"x_units", "translation_error_units"} <= set(names) and not [name for name in names if name.endswith("_m")]
+    assert "gravity_map" not in names and len(names) == len(COLUMNS)
 
 
 def place_of(cam_from_map: np.ndarray | None, down: tuple[float, float, float]) -> list[str]:
     status = "failed" if cam_from_map is None else "localized"
-    text = csv_text([row(0, status=status, cam_from_map=cam_from_map)], np.array(down))
+    text = csv_text(
+        [row(0, status=status, cam_from_map=cam_from_map)], replace(CONFIGURATION, gravity_map=np.array(down))
+    )
     return [next(csv.DictReader(io.StringIO(text)))[name] for name in PLACE]
 
 
@@ -277,6 +285,20 @@ def test_places_that_cannot_be_used_are_said(tmp_path: Path) -> None:
     (tmp_path / "results.jsonl").write_text(json_line(row(0)) + "\n")
     with pytest.raises(InputError, match=r"already holds results.jsonl, but no configuration.json"):
         ResultsLog(tmp_path, CONFIGURATION)
+
+
+def test_results_of_another_configuration_lead_to_the_next_folder(tmp_path: Path) -> None:
+    base, other = tmp_path / "street_auto_0", replace(CONFIGURATION, seed=CONFIGURATION.seed + 1)
+    assert folder_for(base, CONFIGURATION) == base
+    for setting, folder in ((CONFIGURATION, base), (other, tmp_path / "street_auto_0_2")):
+        assert folder_for(base, setting) == folder
+        with ResultsLog(folder, setting):
+            pass
+        assert folder_for(base, setting) == folder
+    assert folder_for(base, replace(other, metric=False)).name == "street_auto_0_3"
+    (base / "configuration.json").write_text("{")
+    with pytest.raises(InputError, match=r"configuration\.json"):
+        folder_for(base, other)
 
 
 @pytest.mark.parametrize("name", ["results.csv", "summary.json", "trajectory.tum", "truth.tum", "trajectory.png"])
