@@ -60,10 +60,14 @@ def test_what_is_written_is_read_again(place: Place) -> None:
     viewpoint = (1.5, -2.25, 3.0, 0.0, 0.125, -1e-05, 45.0)
     request = RunRequest(scene, "ransac-2p", options)
     view = PageView("sample-3", (2, 4), "light", "outcome", viewpoint, "Graph", compared=("mc", "ransac-2p"))
-    view = replace(view, table=TableLook("outliers", "px", down=True), graph="list")
+    view = replace(view, table=TableLook("outliers", "px", down=True), graph="list", side="Recordings")
     found = place.follower.follow(place.link(request, view), place.now, VIEW)
     assert (found.request, found.view, found.remarks) == (request, view, ())
     assert place.follower.follow("", place.now, VIEW).remarks == ()
+    for view in (replace(VIEW, compared=("mc",), side="Compare"), replace(VIEW, compared=("mc",)), VIEW):
+        link = place.link(place.now, view)
+        assert place.follower.follow(link, place.now, VIEW).view.side == view.side
+        assert ("side=" in link) is (view.compared != () and view.side == "Play")
 
 
 def test_a_scene_of_an_allowed_folder_is_opened_again(place: Place) -> None:
@@ -106,6 +110,7 @@ def test_a_scene_of_an_allowed_folder_is_opened_again(place: Place) -> None:
         ("view", "1,2,3,0,0,0,999", "view is"),
         ("theme", "pink", "theme is 'pink'; give dark or light."),
         ("tab", "Play", "tab is 'Play'; give Yaw, Graph, "),
+        ("side", "Share", "side is 'Share'; give Play, Compare, "),
         ("table", "outliers,size", "table is 'outliers,size'; give a filter (all, "),
         ("table", "wrong", "table is 'wrong'; give a filter"),
         ("compare", "mc,magic,mc", "the estimator 'magic' is unknown, so it is not compared."),

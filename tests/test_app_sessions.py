@@ -458,11 +458,14 @@ def test_a_link_counts_as_followed_when_its_step_is_drawn(house: House, monkeypa
     session._touches.deliver(Touch("link", "v=1&step=bearings", 0.0, 0.0, 0.0, 0.0, False))
     until(lambda: session._followed == 1)
     assert session._run is not None
-    session._write_address(session._run)
-    assert "step=outcome" in session._addresses[0].content and 'data-followed="0"' in session._addresses[0].content
+    session._link.write(session._run)
+    assert (
+        "step=outcome" in session._link._addresses[0].content
+        and 'data-followed="0"' in session._link._addresses[0].content
+    )
     gate.set()
-    until(lambda: 'data-followed="1"' in session._addresses[0].content)
-    assert "step=bearings" in session._addresses[0].content
+    until(lambda: 'data-followed="1"' in session._link._addresses[0].content)
+    assert "step=bearings" in session._link._addresses[0].content
 
 
 def test_matches_are_selected_and_changed_by_hand(house: House) -> None:
@@ -568,8 +571,8 @@ def test_a_page_that_is_opened_by_a_link_begins_with_it(house: House, monkeypatc
     assert solved == ["ransac-2p"] and session._run is not None and session._run.request.scene.seed == 6
     until(
         lambda: (
-            "estimator=ransac-2p" in session._addresses[0].content
-            and 'data-followed="1"' in session._addresses[0].content
+            "estimator=ransac-2p" in session._link._addresses[0].content
+            and 'data-followed="1"' in session._link._addresses[0].content
         )
     )
     session.step_history(-1)
@@ -629,9 +632,9 @@ def test_answers_are_hidden_until_they_are_asked_for(house: House) -> None:
     assert not {"cameras/truth", "cameras/estimate"} & drawn()
     shown = house.services.presented.newest
     assert shown is not None and shown.withheld == {"outcome", "truth"}
-    until(lambda: "answers=hidden" in session._addresses[0].content)
+    until(lambda: "answers=hidden" in session._link._addresses[0].content)
     page.set(display._hide, False)
-    until(lambda: "Success" in told() and "answers=hidden" not in session._addresses[0].content)
+    until(lambda: "Success" in told() and "answers=hidden" not in session._link._addresses[0].content)
 
 
 def test_a_link_hides_the_answers_before_its_run_is_seen(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -649,7 +652,7 @@ def test_a_link_hides_the_answers_before_its_run_is_seen(house: House, monkeypat
     monkeypatch.setattr(session._display, "draw", note)
     monkeypatch.setattr(session, "_arrive", arrive_late)
     session._touches.deliver(Touch("link", "v=1&scene=tiny&seed=9&answers=hidden", 0, 0, 0, 0, False))
-    until(lambda: session._arrived == 1)
+    until(lambda: session._link.arrived == 1)
     assert {answers for seed, answers in seen if seed == 9} == {"hidden"}
 
 

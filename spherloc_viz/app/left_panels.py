@@ -11,7 +11,7 @@ from spherloc_viz.app.catalog import Run
 from spherloc_viz.app.controls.steps_panel import StepsPanel
 from spherloc_viz.app.glossary import glossary_html, heading_html, linked
 from spherloc_viz.app.introduction import introduction_html
-from spherloc_viz.app.link import TABS
+from spherloc_viz.app.link import SIDES, TABS
 from spherloc_viz.app.matches.image_panel import ImagePanel
 from spherloc_viz.app.matches.lens_panel import LensPanel
 from spherloc_viz.app.matches.match_table import MatchTablePanel
@@ -58,6 +58,8 @@ class LeftPanels:
         self._opening = self._of_step = self._asked = self._elsewhere = ""
         self.tab = TABS[0]
         """The view that a person or a link has brought to the front, for the page's link."""
+        self.side = SIDES[0]
+        """The tab that is seen right of the canvas, or was before Share, for the page's link."""
         self._seen, self._changed = frozenset({"Yaw"}), changed
         touches.on("views", self._see)
         with _view(gui, views, "Yaw"):
@@ -131,13 +133,14 @@ class LeftPanels:
         if "Yaw" in self._seen:
             self._yaw.prepare(run.trace, picture.step.key, selected, run.kept, hidden, _yaw_chart(picture, hidden))
 
-    def open_tab(self, tab: str, elsewhere: str = "") -> None:
-        """Bring a view to the front, and a tab of another panel, once: then it is the person's to choose."""
+    def open_tab(self, tab: str, side: str | None = None) -> None:
+        """Bring a view to the front, and a tab of the panel right of the canvas, once: then it is the person's to
+        choose."""
         self.tab = tab
         if tab != TABS[0]:
             self._asked = _once_more(tab, self._asked)
-        if elsewhere:
-            self._elsewhere = _once_more(elsewhere, self._elsewhere)
+        if side is not None and side != self.side:
+            self.side, self._elsewhere = side, _once_more(side, self._elsewhere)
 
     def show_reference(self, number: int) -> None:
         """Bring the images to the front, the query with that reference."""
@@ -168,6 +171,8 @@ class LeftPanels:
         if (seen.of_step, seen.of_link) == (self._of_step, self._asked):
             chosen = [] if seen.of_step in seen.names else [name for name in TABS[1:] if name in seen.names]
             self.tab = chosen[0] if chosen else TABS[0]
+        if seen.elsewhere == self._elsewhere:
+            self.side = next((name for name in SIDES if name in seen.names), self.side)
         self._changed(None)
 
     def _widen(self, touch: Touch) -> None:

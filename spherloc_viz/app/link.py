@@ -36,6 +36,8 @@ THEMES = ("dark", "light")
 ANSWERS = (TOLD, HIDDEN, ONLY_OUTCOME)
 TABS = ("step's", "Yaw", "Graph", "Charts", "Residuals", "Images", "Matches")
 """The tabs of the lower left panel, after the word for the one that goes with the step."""
+SIDES = ("Play", "Compare", "Sweep", "Open", "Recordings")
+"""The tabs of the panel right of the canvas but for Share, from which links are taken."""
 SCENE_KEYS = ("scene", "case", "place")
 MAX_NAMED = 5
 """Most matches or estimators that one remark names."""
@@ -43,7 +45,7 @@ LISTS = ("spoil", "mend", "hide")
 """Keys of ``EDITS``, in their order."""
 ONCE = (
     *("v", "run", "scene", "case", "place", "seed", "query", "camera", *LISTS, "estimator"),
-    *("step", "select", "view", "theme", "answers", "tab", "compare", "table", "graph"),
+    *("step", "select", "view", "theme", "answers", "tab", "side", "compare", "table", "graph"),
 )
 MANY = ("set", "option")
 
@@ -68,6 +70,8 @@ class PageView:
     """Filter and order of the table of matches."""
     graph: str = LOOKS[0]
     """Look of the graph of balls."""
+    side: str = SIDES[0]
+    """The tab of the panel right of the canvas."""
 
 
 def link_of(
@@ -100,6 +104,7 @@ def link_of(
         ("select", _numbers_text(view.selected)),
         ("view", ",".join(f"{number:.6g}" for number in view.viewpoint)),
         ("tab", view.tab if view.tab != TABS[0] else None),
+        ("side", view.side if view.side != _usual_side(view.compared) else None),
         ("theme", view.theme if view.theme != THEMES[0] else None),
         ("answers", view.answers if view.answers != ANSWERS[0] else None),
         ("compare", ",".join(view.compared)),
@@ -313,7 +318,13 @@ def _view(said: dict[str, Any], view: PageView, opened: Opened | None, remarks: 
         remarks.append(str(error))
     graph = _one_of(said, "graph", LOOKS, remarks)
     compared = _compared(said.get("compare", ""), remarks)
-    return PageView(step, selected, theme, answers, viewpoint, tab, compared, table, graph)
+    side = _one_of(said, "side", SIDES, remarks) if "side" in said else _usual_side(compared)
+    return PageView(step, selected, theme, answers, viewpoint, tab, compared, table, graph, side)
+
+
+def _usual_side(compared: tuple[str, ...]) -> str:
+    """The tab right of the canvas where a link names none."""
+    return "Compare" if compared else SIDES[0]
 
 
 def _compared(text: str, remarks: list[str]) -> tuple[str, ...]:

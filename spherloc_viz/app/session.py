@@ -1,7 +1,6 @@
 """One browser client: its own widgets, canvas, run and threads."""
 
 import math
-import secrets
 import time
 from collections import deque
 from collections.abc import Iterable
@@ -25,13 +24,12 @@ from spherloc.types import FloatArray
 from spherloc.watch import Cancelled, Watch
 from spherloc_viz.app.catalog import Run, RunRequest, SceneRequest
 from spherloc_viz.app.controls.controls import Controls
-from spherloc_viz.app.controls.steps_panel import find_step
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.history import History
-from spherloc_viz.app.link import Followed, Follower, PageView, address_html, link_of
+from spherloc_viz.app.link import Followed, Follower
 from spherloc_viz.app.map_pictures import MapPictures
+from spherloc_viz.app.page_link import PageLink
 from spherloc_viz.app.page_runs import Known, PageRuns
-from spherloc_viz.app.panels.compare_panel import VIEW as COMPARE
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.panels.folders import Roots
 from spherloc_viz.app.review.opened import Opened
@@ -41,11 +39,9 @@ from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Notices, Status
 from spherloc_viz.app.text import begun
 from spherloc_viz.app.web.touch import READY, Touch, Touches
-from spherloc_viz.app.web.viser_internals import at_once, follow_changes, guard_callbacks, is_linked, update_widget
+from spherloc_viz.app.web.viser_internals import at_once, follow_changes, guard_callbacks, is_linked
 from spherloc_viz.app.workers import Job, LatestWorker
-from spherloc_viz.layers import steps
 from spherloc_viz.layers.withheld import TOLD
-from spherloc_viz.lessons.numbers import number_text, numbers_of
 
 QUIET_S = 0.7
 """Runs count as settled, and are recorded, when nothing has changed for this long."""
@@ -88,12 +84,7 @@ class Session:
         self._links: deque[tuple[int, str]] = deque()
         """Links that are still to be followed; before each stands the number of the change that came before it."""
         self._followed = 0
-        """How many links were followed, ..."""
-        self._arrived = 0
-        """... and of how many the page shows the step."""
-        self._in_lesson = False
-        self._numbers: tuple[Trace, dict[str, str]] | None = None
-        """The numbers of a run as text, for the lesson that shows this page in a frame."""
+        """How many links were followed."""
         self._run: Run | None = None
         self._answers = 0
         """The number of the newest change that the run knows, or an earlier one."""
@@ -114,12 +105,10 @@ class Session:
         self._built = True
         # Only now may the page report presses: all handlers are registered.
         client.gui.add_html(READY)
-        # And only then may it see where its address is kept: it tells the link that it was opened by at once.
-        self._name = secrets.token_hex(8)
         self._display.panels.ready()
-        self._addresses = client.gui.add_html(""), self._display.panels.address
-        """Twice, since a panel that is folded tells nothing."""
-        self._tell_address(address_html("", self._name, 0))
+        # And only then may it see where its address is kept.
+        page = self._controls, self._display, self._edits
+        self._link = PageLink(client, services, self._catalog, self._roots, page)
 
     def start(self) -> None:
         """Solve and show the first problem, or the recorded run that was asked for; where the page was opened by a
@@ -199,7 +188,7 @@ class Session:
 
     def _tell_numbers(self, touch: Touch) -> None:
         """A lesson that shows this page in a frame asks for the numbers of its runs."""
-        self._in_lesson = True
+        self._link.in_lesson = True
         self._display.canvas.fill_page()
         self._page.ask()
 
@@ -307,8 +296,10 @@ class Session:
         number, link = links[-1]
         arrived = True
         try:
-            followed = self._follower.follow(link, self._shown_request(), self._view())
-            self._hide_first(followed, number)
+            followed = self._follower.follow(link, self._shown_request(), self._link.view(self._run))
+            if followed.view.answers != TOLD:
+                with self._changes.as_of(number):
+                    self._link.hide(followed)
             if followed.request is not None:
                 self._asked.append((number, followed.request))
             pause = self._solve_request()
@@ -324,12 +315,6 @@ class Session:
             else:  # the run was ended for a newer change, and is made again with it
                 self._links.extendleft(reversed(links))
 
-    def _hide_first(self, followed: Followed, number: int) -> None:
-        """What a link hides is hidden before its run is there, which else would be seen with it."""
-        if followed.request is not None and followed.view.answers != TOLD:
-            with self._changes.as_of(number):
-                self._controls.display.answers = followed.view.answers
-
     def _shown_request(self) -> RunRequest:
         """The request of the run at hand; before there is one, what the page begins with."""
         if self._run is not None:
@@ -337,43 +322,11 @@ class Session:
         return RunRequest(self._controls.scene.read(), *self._controls.estimator.read())
 
     def _arrive(self, followed: Followed, number: int) -> None:
-        """A link was followed: set step, selection and viewer. ``number`` is that of the change before it."""
-        remarks = list(followed.remarks)
-        if followed.request is not None:
-            with self._changes.as_of(number):
-                self._controls.display.theme = followed.view.theme
-                self._controls.display.answers = followed.view.answers
-        if followed.request is not None and self._run is not None:
-            kept = set(self._run.kept.tolist())
-            self._edits.select(set(followed.view.selected) & kept)
-            key = _step_key(self._run.trace, followed)
-            remarks += followed.missing(key, kept)
-            self._display.panels.steps.go(key)
-            self._display.panels.matches.look = followed.view.table
-            self._display.panels.graph.look = followed.view.graph
-            compared = followed.view.compared
-            self._display.panels.open_tab(followed.view.tab, COMPARE if compared else "")
-            self._controls.compare.follow(self._run.trace, compared)
-            if followed.view.viewpoint:
-                self._display.canvas.hold(key, followed.view.viewpoint)
+        """A link was followed, and its run is there. ``number`` is that of the change before it."""
+        with self._changes.as_of(number):
+            remarks = self._link.arrive(followed, self._run)
         if remarks:
             self._status.complain(" ".join(begun(remark) for remark in remarks), lasting=True)
-
-    def _view(self) -> PageView:
-        """What the page shows of its run, for its link."""
-        display, run = self._controls.display, self._run
-        selected = () if run is None else tuple(run.kept[list(self._edits.places(run.kept))].tolist())
-        return PageView(
-            self._display.step_key,
-            selected,
-            display.theme,
-            display.answers,
-            self._display.canvas.viewpoint(),
-            self._display.panels.tab,
-            () if run is None else self._controls.compare.compared(run.trace),
-            replace(self._display.panels.matches.look, page=0),
-            self._display.panels.graph.look,
-        )
 
     def _open_linked(self, file: str) -> Opened:
         """Open the recording that a link names."""
@@ -506,34 +459,14 @@ class Session:
         self._services.presented.hide(run, withheld)
         self._status.hide_answers(bool(withheld))
         pause = self._display.draw(run, self._mesh(run), diagnosis, self._edits.places(run.kept), asked, answers)
-        self._arrived = followed
-        if self._in_lesson:
-            self._write_address(run)
+        self._link.arrived = followed
+        if self._link.in_lesson:
+            self._link.write(run)
         self._viewer.ask()
         if diagnosis is None:
             self._diagnoser.ask()
         self._due_s = math.inf if pause is None else time.monotonic() + pause
         return PREPARE_AFTER_S if pause is None else min(pause, PREPARE_AFTER_S)
-
-    def _write_address(self, run: Run) -> None:
-        """Write what the page shows into the address of the browser."""
-        opened = self._controls.review.opened
-        recording = opened.recorded.row.file if opened is not None and opened.request == run.request else None
-        link = link_of(run, self._view(), self._catalog, self._services.catalog.scenes, self._roots, recording)
-        html = address_html(link, self._name, self._arrived, self._told_numbers(run.trace))
-        self._tell_address(html)
-
-    def _tell_address(self, html: str) -> None:
-        for widget in self._addresses:
-            update_widget(widget, content=html)
-
-    def _told_numbers(self, trace: Trace) -> dict[str, str] | None:
-        """The run's numbers for the lesson that shows this page in a frame; empty without a lesson."""
-        if not self._in_lesson:
-            return None
-        if self._numbers is None or self._numbers[0] is not trace:
-            self._numbers = trace, {name: number_text(value) for name, value in numbers_of(trace).items()}
-        return self._numbers[1]
 
     def _follow_viewer(self, asked: bool) -> float | None:
         """The viewer thread's job: once the viewer stands still, write its place into the address."""
@@ -541,7 +474,7 @@ class Session:
         if asked:
             return VIEWER_STILL_S
         if run is not None and self._display.step_key:
-            self._write_address(run)
+            self._link.write(run)
         return None
 
     def _examine(self, asked: bool) -> float | None:
@@ -574,14 +507,6 @@ class Session:
 def _taken(queue: deque[T]) -> list[T]:
     """Take all items that wait in a queue, without waiting for more."""
     return [queue.popleft() for _ in range(len(queue))]
-
-
-def _step_key(trace: Trace, followed: Followed) -> str:
-    """The key of the step that a link names; for a recording without one, that of the key step."""
-    timeline, opened = steps(trace), followed.opened
-    if opened is not None and not followed.view.step:
-        return timeline[min(opened.recorded.row.key_step, len(timeline) - 1)].key
-    return timeline[find_step(timeline, followed.view.step)].key
 
 
 def _kept(request: RunRequest, problem: Problem) -> NDArray[np.int64]:

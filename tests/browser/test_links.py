@@ -70,14 +70,17 @@ def test_a_reload_and_a_link_bring_back_what_is_shown(
     tab.expect_card(7)
     sorted_by = tab.page.locator("[data-touch='match-sort:px']")
     sorted_by.click()
-    wanted = "set=outlier_rate%3D0.49&estimator=ransac-2p&option=iterations%3D321&step=bearings&select=7&tab=Matches"
+    tab.tab("Sweep")
+    shared = "set=outlier_rate%3D0.49&estimator=ransac-2p&option=iterations%3D321&step=bearings&select=7&tab=Matches"
+    wanted = f"{shared}&side=Sweep"
     expect(tab.page).to_have_url(re.compile("&seed=4&" + wanted + "&table=all%2Cpx$"))
     link, before = tab.page.url, shown(tab)
     tab.page.reload()
     tab.expect_card(7)
     expect(tab.value("estimator")).to_have_text("ransac-2p")
     assert shown(tab) == before and tab.page.url == link
-    expect(tab.page.get_by_role("tab", name="Matches")).to_have_attribute("aria-selected", "true")
+    for name in ("Matches", "Sweep"):
+        expect(tab.page.get_by_role("tab", name=name)).to_have_attribute("aria-selected", "true")
     expect(sorted_by).to_have_text("px ▴")
     tab.press("Undo")  # nothing was shown before the link
     assert tab.still(lambda: shown(tab), "the page stays") == before
@@ -87,6 +90,7 @@ def test_a_reload_and_a_link_bring_back_what_is_shown(
     other.page.goto(link.replace("v=1", "v=2") + "&theme=light&colour=red")
     other.expect_card(7)
     assert shown(other) == before
+    expect(other.page.get_by_role("tab", name="Sweep")).to_have_attribute("aria-selected", "true")
     expect(other.page).to_have_url(re.compile(wanted + "&theme=light&table=all%2Cpx$"))
     said = other.page.get_by_text(re.compile("The link is of version '2'.* says 'colour', which this version"))
     expect(said.first).to_be_visible()

@@ -1,7 +1,8 @@
 """The panel right of the canvas: its tabs Play, Compare, Sweep, Open, Recordings and Share."""
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -206,28 +207,22 @@ class Controls:
         self._moves.on_click(self._move)
         self.review = ReviewCard(owner.redraw)
         tabs = gui.add_tab_group()
-        with tabs.add_tab("Play"):
-            self.review.stand(gui)
+        with self._tab(gui, tabs, "Play"):
             self._build_play(gui, touches)
-        with tabs.add_tab("Compare"):
-            self.review.stand(gui)
+        with self._tab(gui, tabs, "Compare"):
             gui.add_html(heading_html("Several estimators on this problem", "estimator"))
             self.compare = ComparePanel(gui, touches, owner.use_estimator, owner.redraw, owner.prepare_estimator)
-        with tabs.add_tab("Sweep"):
-            self.review.stand(gui)
+        with self._tab(gui, tabs, "Sweep"):
             gui.add_html(heading_html("From where on does an estimator fail?", "sweep"))
             self._sweep = SweepPanel(gui, touches, self._chosen_sweep, services.recorder)
-        with tabs.add_tab("Open"):
-            self.review.stand(gui)
+        with self._tab(gui, tabs, "Open"):
             gui.add_html(heading_html("Other scenes, your own photographs, and your own matches", "scene"))
             self._open = OpenPanel(gui, client, touches, services.roots, self._open_scene, self._scene_file)
-        with tabs.add_tab("Recordings"):
-            self.review.stand(gui)
+        with self._tab(gui, tabs, "Recordings"):
             gui.add_html(heading_html("Recorded runs, and a gallery of failures", "recording"))
             page = RecordingsPage(services.roots, self._enter, owner.open, owner.open_recorded, services.downloads)
             self._recordings = RecordingsPanel(gui, client, touches, services.library, self.review, page)
-        with tabs.add_tab("Share"):
-            self.review.stand(gui)
+        with self._tab(gui, tabs, "Share"):
             self._export = ExportPanel(gui, client, owner.shown)
         undo: Any = gui.add_command(UNDO, hotkey="Z", modifier="cmd/ctrl")
         redo: Any = gui.add_command(REDO, hotkey="Z", modifier="cmd/ctrl+shift")
@@ -235,6 +230,14 @@ class Controls:
         redo.on_trigger(lambda event: owner.step_history(1))
         gui.main_panel.dock_right()
         gui.main_panel.set_width(width_px)
+
+    @contextmanager
+    def _tab(self, gui: viser.GuiApi, tabs: viser.GuiTabGroupHandle, name: str) -> Iterator[None]:
+        """The content of a tab, which begins with the review at hand; the page reports whether it can be seen."""
+        with tabs.add_tab(name):
+            gui.add_html(f'<div data-view="{name}" data-side></div>')
+            self.review.stand(gui)
+            yield
 
     def _build_play(self, gui: viser.GuiApi, touches: Touches) -> None:
         gui.add_html(heading_html("Drag a slider: each move is solved at once", "estimator"))

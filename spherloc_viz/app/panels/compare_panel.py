@@ -105,7 +105,6 @@ class ComparePanel:
         self._use, self._changed, self._prepare = use, changed, prepare
         self._names = ordered(usable_estimators())
         self._ticked = {name for name in self._names if name in TICKED}
-        gui.add_html(f'<div data-view="{VIEW}"></div>')
         self._choice = gui.add_html(chips_html("compare", self._names, self._ticked))
         self._button = gui.add_button(START, hint="Run the ticked estimators on the problem at hand.")
         self._live = gui.add_checkbox("Live", False, hint="Compare again whenever the problem changes.")

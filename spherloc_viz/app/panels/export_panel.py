@@ -70,7 +70,6 @@ class ExportPanel:
         self._background = BackgroundWorker(f"spherloc-export-{client.client_id}", self._complain)
         self._code: tuple[str, str] | None = None
         self._hidden = False
-        gui.add_html(f'<div data-view="{VIEW}"></div>')
         gui.add_html(heading_html("Send what you see, or repeat it elsewhere", "recording"))
         gui.add_html(LINK)
         buttons = (

@@ -61,7 +61,6 @@ class RecordingsPanel:
     ) -> None:
         name = str(client.client_id)
         self._library, self._page = library, page
-        gui.add_html(f'<div data-view="{VIEW}"></div>')
         self._switch = gui.add_html(_switch_html(RUNS if library is not None else GALLERY))
         self._status = gui.add_html("", visible=False)
         self._parts: list[RunList | Notes | Reviewer | Exporter | GalleryList] = []

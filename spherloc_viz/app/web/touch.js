@@ -38,7 +38,7 @@
     if (!document.querySelector("[data-ready]")) return;
     document.documentElement.classList.add("opened");  // also when all panels are folded later
     seen = seenElements("[data-view]").map((view) => view.dataset.view).sort().join(",");
-    const report = [seen, front, asked].join(";");
+    const report = [seen, front, asked, elsewhere].join(";");
     if (report === told) return;
     told = report;
     const nowhere = { left: 0, top: 0, width: 1, height: 1 };
@@ -62,7 +62,7 @@
     const wanted = document.querySelector("[data-front]")?.dataset.front ?? "", views = (seen ?? "").split(",");
     const late = opening !== front && views.includes(opening);  // what was opened for a step that has been left since
     if (!wanted || (wanted === front && !late) || seen === null) return;
-    if (front !== "" && seen === "") return; // no view is to be seen, as while one is drawn anew: nobody has left it
+    if (front !== "" && !seenElements("[data-view]:not([data-side])").length) return; // no view is to be seen, as while one is drawn anew: nobody has left it
     const follows = (front === "" || views.includes(front) || views.includes(opening)) && linkedTab() === asked;
     if (follows) opening = wanted;
     if (follows && !openTab(wanted)) return;

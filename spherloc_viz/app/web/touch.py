@@ -46,12 +46,15 @@ class SeenViews:
     """The view that the page has opened last since it goes with a step."""
     of_link: str
     """That which it has opened last for a link."""
+    elsewhere: str
+    """The tab of the panel right of the canvas that it has opened last for a link."""
 
 
 def seen_views(argument: str) -> SeenViews:
-    """What the argument of the action "views" says, "NAME,NAME;VIEW OF STEP;VIEW OF LINK"; what is missing is empty."""
-    names, of_step, of_link = (argument + ";;").split(";")[:3]
-    return SeenViews(frozenset(names.split(",")), of_step, of_link)
+    """What the argument of the action "views" says, "NAME,NAME;VIEW OF STEP;VIEW OF LINK;TAB OF LINK"; what is missing
+    is empty."""
+    names, of_step, of_link, elsewhere = (argument + ";;;").split(";")[:4]
+    return SeenViews(frozenset(names.split(",")), of_step, of_link, elsewhere)
 
 
 Handler = Callable[[Touch], object]
