@@ -54,6 +54,11 @@ READY_S, STARTS = 1.5, 5
 CROWD = 5
 
 
+def opening_of(page: PageClient) -> str:
+    """The title of the step at which the page opens; empty while it has no such step."""
+    return next((title for title in page.widget("Step").props["options"] if title.endswith(OPENINGS)), "")
+
+
 async def prepare(page: PageClient, case: Case) -> None:
     """Bring a page to a case, at the step at which a page of that estimator opens: elsewhere more or less is drawn."""
     await page.until(lambda: page.says("data-ready"), 120.0)
@@ -63,7 +68,8 @@ async def prepare(page: PageClient, case: Case) -> None:
     await page.until(lambda: page.says(f"of {case.points}<"))
     await asyncio.sleep(2.0)
     await page.settle(0.5)
-    opening = next(title for title in page.widget("Step").props["options"] if title.endswith(OPENINGS))
+    await page.until(lambda: opening_of(page))
+    opening = opening_of(page)
     await page.set("Step", opening)
     await page.until(lambda: page.widget("Step").value == opening)
     await asyncio.sleep(1.0)

@@ -20,7 +20,7 @@ from spherloc.errors import InputError
 from spherloc.estimators import estimate
 from spherloc.files import is_image, names_in
 from spherloc.geometry import camera_centre
-from spherloc.mapping.make import Map, ScaleMeasurement, make_map
+from spherloc.mapping.make import Map, MapRequest, make_map
 from spherloc.mapping.photographs import new_images_of, photographs
 from spherloc.outcome import judge
 from spherloc.types import FloatArray
@@ -31,7 +31,7 @@ def mapped(images: Path, output: Path, features: str | None, queries: Path | Non
     """The map of a folder of panoramas, with a scene for the photographs in ``queries``."""
     found = photographs(images, {})
     others = None if queries is None else new_images_of(queries, found)[0]
-    return make_map(found.views, images, output, ScaleMeasurement(), others, lambda *_: None, how=how_of(features))
+    return make_map(MapRequest(found.views, images, new_images=others, how=how_of(features)), output)
 
 
 def shrunk(source: Path, target: Path, width: int | None) -> None:

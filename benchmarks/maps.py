@@ -20,7 +20,7 @@ from spherloc.datasets.scene_file import load_scene
 from spherloc.errors import InputError
 from spherloc.experiments.summary import align
 from spherloc.geometry import camera_centre
-from spherloc.mapping.make import ScaleMeasurement, make_map
+from spherloc.mapping.make import MapRequest, make_map
 from spherloc.mapping.photographs import photographs
 from spherloc.types import FloatArray
 from spherloc_viz.commands.map import how_of
@@ -84,9 +84,7 @@ def row(world: str, count: int, features: str) -> str:
         places = photographed(world, count, folder)
         views = photographs(folder, {}).views
         try:
-            made = make_map(
-                views, folder, Path(place) / "map", ScaleMeasurement(), None, lambda *_: None, how=how_of(features)
-            )
+            made = make_map(MapRequest(views, folder, how=how_of(features)), Path(place) / "map")
         except InputError as error:
             return f"| {world}, {count} | none: {error} | | | |"
         maps = [one.written.poses for one in (made, *made.groups)]

@@ -27,7 +27,7 @@ from spherloc.errors import InputError
 from spherloc.files import is_image, names_in
 from spherloc.geometry import camera_centre
 from spherloc.images import read_image
-from spherloc.mapping.make import ScaleMeasurement, make_map
+from spherloc.mapping.make import MapRequest, make_map
 from spherloc.mapping.photographs import photographs
 from spherloc.mapping.scene_files import toml_value
 from spherloc.mapping.unknown_lens import find_lens
@@ -155,7 +155,7 @@ def mapped(folder: Path, cameras: dict[str, Camera], places: dict[str, FloatArra
     """How the maps of a folder are off, in a cell of the table, and the lens that was found."""
     photos = photographs(folder, cameras, find_lens=_find)
     with TemporaryDirectory() as place:
-        made = make_map(photos.views, folder, Path(place) / "map", ScaleMeasurement(), None, lambda *_: None)
+        made = make_map(MapRequest(photos.views, folder), Path(place) / "map")
         maps = [one.written.poses for one in (made, *made.groups)]
     off = np.concatenate([errors_m(poses, places) for poses in maps if len(poses) >= FEW])
     sizes = " + ".join(str(len(poses)) for poses in maps)

@@ -53,6 +53,28 @@ class ScaleMeasurement:
 
 
 @dataclass(frozen=True, eq=False)
+class MapRequest:
+    """What a map is made of, and how."""
+
+    views: Sequence[View]
+    """Images of one camera or several."""
+    images: Path
+    """Their folder."""
+    measured: ScaleMeasurement = field(default_factory=ScaleMeasurement)
+    """What gives the scale."""
+    new_images: NewImages | None = None
+    """Other images, for which a scene is written too."""
+    masks: Masks | None = None
+    """The masks of the views, which are written into the scenes."""
+    how: FrontendOptions = field(default_factory=FrontendOptions)
+    """Which features are matched, and how."""
+    find_carried: bool = True
+    """Whether what moves with the camera below panoramas is found and left out, too."""
+    stated: StatedGravity | None = None
+    """Gravity that a file states."""
+
+
+@dataclass(frozen=True, eq=False)
 class Map:
     """A finished map, and how it came about."""
 
@@ -73,35 +95,19 @@ class Map:
     """Gravity of photographs that a file states, by name."""
 
 
-def make_map(
-    views: Sequence[View],
-    images: Path,
-    folder: Path,
-    measured: ScaleMeasurement,
-    new_images: NewImages | None,
-    tell: Tell,
-    masks: Masks | None = None,
-    how: FrontendOptions | None = None,
-    *,
-    find_carried: bool = True,
-    stated: StatedGravity | None = None,
-) -> Map:
-    """Make a map of images of one camera or several and write it into ``folder``.
+def make_map(request: MapRequest, folder: Path, tell: Tell = lambda *_: None) -> Map:
+    """Make a map and write it into ``folder``, with a scene for the new images too.
 
-    For ``new_images``, a scene is written too; ``masks`` are the masks of the views, which are written into the scenes,
-    and ``how`` says which features are matched. With ``find_carried``, what moves with the camera below panoramas is
-    found and left out, too; ``stated`` is gravity that a file states. Raises ``InputError`` if the images give no map,
-    if ``measured`` names other images, or if a file cannot be read: then nothing is left in ``folder`` but a map that
-    was finished before. Raises ``StoppedError`` if a file cannot be written: what is done is kept there and not done
-    again.
+    Raises ``InputError`` if the images give no map, if the measurement names other images, or if a file cannot be read:
+    then nothing is left in ``folder`` but a map that was finished before. Raises ``StoppedError`` if a file cannot be
+    written: what is done is kept there and not done again.
     """
-    names = {view.name for view in views}
-    for name in () if measured.distance is None else measured.distance[:2]:
+    names, distance = {view.name for view in request.views}, request.measured.distance
+    for name in () if distance is None else distance[:2]:
         if name not in names:
-            raise InputError(f"{show(name)} is not one of the {len(views)} photographs; give the names of two files.")
+            raise InputError(f"{show(name)} is not one of the {len(names)} photographs; give the names of two files.")
     with _folder_of_map(folder):
-        what = folder, views, images, measured, new_images, tell, masks, how
-        return _map_in(*what, find_carried=find_carried, stated=stated)
+        return _map_in(folder, request, tell)
 
 
 @contextmanager
@@ -130,34 +136,23 @@ def _folder_of_map(folder: Path) -> Iterator[None]:
                 folder.rmdir()
 
 
-def _map_in(
-    folder: Path,
-    views: Sequence[View],
-    images: Path,
-    measured: ScaleMeasurement,
-    new_images: NewImages | None,
-    tell: Tell,
-    masks: Masks | None,
-    how: FrontendOptions | None,
-    *,
-    find_carried: bool,
-    stated: StatedGravity | None,
-) -> Map:
+def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
     """``make_map`` in a folder that is there."""
+    views, masks, stated, measured = request.views, request.masks, request.stated, request.measured
     if measured == ScaleMeasurement():
         measured = ScaleMeasurement(positions=gps_of_images(views))
-    carried_deg = carried_nadir_deg(views, tell) if find_carried else 0.0
+    carried_deg = carried_nadir_deg(views, tell) if request.find_carried else 0.0
     if carried_deg:
         views, _ = Masks(nadir_deg=carried_deg).on(views)
         masks = replace(masks or Masks(), nadir_deg=carried_deg)
-    kept = Kept(masks, how or FrontendOptions(), stated)
+    kept = Kept(masks, request.how, stated)
     known = {} if stated is None else stated.found
     lines = gravity_by_lines([view for view in views if view.name not in known], tell)
     gravity = {**known, **lines.found}
-    first, *others = reconstruct(views, [gravity.get(view.name) for view in views], folder, tell, how)
+    first, *others = reconstruct(views, [gravity.get(view.name) for view in views], folder, tell, request.how)
     found = _finished(first, views, nearer_to_others(first, others), gravity, measured, tell)
     inside = set(found[0].poses)
-    written = write_map(*found, views, images, folder, new_images, kept)
+    written = write_map(*found, views, request.images, folder, request.new_images, kept)
     made = Map(*found, written, lines, features=kept.how.features.method, carried_deg=carried_deg, stated=known)
     groups: list[Map] = []
     for other in others:
@@ -177,7 +172,7 @@ def _map_in(
         except OSError as error:
             raise InputError(f"{place}: cannot be made ({error.strerror}); {advice('other folder')}.") from None
         group, level, scale = found
-        own = write_map(*found, views, images, place, new_images, kept)
+        own = write_map(*found, views, request.images, place, request.new_images, kept)
         groups.append(replace(made, made=group, level=level, scale=scale, written=own))
     return replace(made, groups=tuple(groups))
 

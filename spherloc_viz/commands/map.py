@@ -33,7 +33,7 @@ from spherloc.images import check_image, read_size
 from spherloc.mapping.advice import advice, for_a_page
 from spherloc.mapping.kept_scale import FILE as SCALE_FILE
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
-from spherloc.mapping.make import Map, ScaleMeasurement, make_map
+from spherloc.mapping.make import Map, MapRequest, ScaleMeasurement, make_map
 from spherloc.mapping.photographs import (
     CalibratedLens,
     LensFinder,
@@ -108,8 +108,8 @@ def make(
                 say(f"{new_images}: {remark}")
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
         try:
-            what = found.views, folder, target, measured, others, tell, masks, how
-            made = make_map(*what, find_carried=find_carried, stated=stated)
+            request = MapRequest(found.views, folder, measured, others, masks, how, find_carried, stated)
+            made = make_map(request, target, tell)
         except KeyboardInterrupt:
             say("stopped; what is done is kept, and the same command goes on from there.")
             raise
@@ -337,7 +337,7 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
             measured = scale_of_words(scale)
             if measured == ScaleMeasurement():
                 measured = kept_scale(output)
-            made = make_map(found.views, folder, output, measured, None, _progress, how=how_of())
+            made = make_map(MapRequest(found.views, folder, measured, how=how_of()), output, _progress)
             _write(report, made, found, measured)
         except SpherlocError as error:
             _tell({"error": str(error)})

@@ -8,7 +8,7 @@ import pytest
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.frontend.masks import around
 from spherloc.mapping.carried import BELOW_DEG, carried_nadir_deg
-from spherloc.mapping.make import ScaleMeasurement, make_map
+from spherloc.mapping.make import MapRequest, make_map
 from spherloc.mapping.photographs import photographs
 from spherloc_viz.commands.map_report import summary
 from tests.frontend.pictures import texture
@@ -75,7 +75,7 @@ def test_real_places_with_one_tripod_are_maps_of_their_own(tmp_path):
     for path in folder.glob("*.png"):
         shutil.copy(path, tmp_path)
     found = photographs(tmp_path, {})
-    made = make_map(found.views, tmp_path, tmp_path / "map", ScaleMeasurement(), None, lambda *_: None)
+    made = make_map(MapRequest(found.views, tmp_path), tmp_path / "map")
     assert 24.0 <= made.carried_deg <= 36.0
     rooms = [{name.partition("_")[0] for name in one.written.poses} for one in (made, *made.groups)]
     assert sorted(map(sorted, rooms)) == [["hall"], ["room"], ["stairs"]]

@@ -28,7 +28,7 @@ from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.advice import COMMAND, PAGE, for_a_page
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
-from spherloc.mapping.make import ScaleMeasurement, make_map, scale_of
+from spherloc.mapping.make import MapRequest, ScaleMeasurement, make_map, scale_of
 from spherloc.mapping.new_queries import add_new_images, map_images
 from spherloc.mapping.photographs import (
     NewImages,
@@ -83,7 +83,7 @@ def walk(tmp_path_factory):
 
     def again():
         new = NewImages(folder, None)
-        return make_map(found.views, folder, output, measured, new, lambda *what: told.append(what), masks)
+        return make_map(MapRequest(found.views, folder, measured, new, masks), output, lambda *what: told.append(what))
 
     return poses, found, again(), again, told, output
 
@@ -117,7 +117,7 @@ def test_panoramas_straight_ahead_of_each_other_are_mapped(walk, tmp_path):
         turn = poses[other.name][:, :3] @ poses[one.name][:, :3].T
         way = poses[other.name][:, 3] - turn @ poses[one.name][:, 3]
         assert abs(way[2]) > 0.99 * np.linalg.norm(way)
-    made = make_map(views, views[0].path.parent, tmp_path / "map", ScaleMeasurement(), None, lambda *_: None)
+    made = make_map(MapRequest(views, views[0].path.parent), tmp_path / "map")
     assert len(made.written.poses) == 3
 
 
@@ -153,9 +153,9 @@ def test_gravity_that_a_file_states_goes_before_that_of_lines(walk, tmp_path):
     assert "1 of its 4 rows belong to none of the photographs, the first is else.png" in strange
     assert "2 of 5 photographs have no gravity there, the first is reference_005.png" in without
     shutil.copytree(output, tmp_path / "map")
-    images, nothing = found.views[0].path.parent, lambda *what: None
+    images = found.views[0].path.parent
     new = NewImages(images, None)
-    made = make_map(found.views, images, tmp_path / "map", ScaleMeasurement(), new, nothing, stated=stated)
+    made = make_map(MapRequest(found.views, images, new_images=new, stated=stated), tmp_path / "map")
     assert made.level.source == "the gravity file of 3 images and vertical lines of 2 images"
     assert sorted(made.stated) == names[:3] and sorted(made.lines.found) == names[3:]
     page = map_report(made, found)
@@ -172,6 +172,29 @@ def test_gravity_that_a_file_states_goes_before_that_of_lines(walk, tmp_path):
     (tmp_path / "none.txt").write_text("else.png 0 1 0")
     with pytest.raises(InputError, match=r"none.txt: has gravity of none of the 5 photographs; name them as"):
         read_stated_gravity(tmp_path / "none.txt", None, found.views)
+
+
+def test_one_command_localizes_new_photographs(walk, tmp_path, monkeypatch, capsys):
+    """Those of the map itself; the same command again finds them done, and a map in metres of its own has its own."""
+    _, found, *_, output = walk
+    images = found.views[0].path.parent
+    shutil.copytree(output, tmp_path / "map")
+    monkeypatch.chdir(tmp_path)
+    given = {"output": Path("map"), "localize": images, "nadir": 12.0, "features": "sift"}
+    results = Path("recordings") / f"map_{images.name}_auto_0"
+    assert map_command(images, distance=("reference_002.png", "reference_003.png", "3"), **given) == 0
+    told = capsys.readouterr().out
+    assert "5 of 5 queries are localized" in told and f"written to {results}" in told
+    assert told.splitlines()[-1] == f"see it        spherloc play {Path('map') / images.name}.toml"
+    assert len(list((results / "recordings").glob("*.rrd"))) == 5
+    assert map_command(images, **given) == 0
+    told = capsys.readouterr()
+    assert f"{results}: 5 of 5 queries are done already" in told.err and "see it" in told.out
+    assert map_command(images, distance=("reference_002.png", "reference_003.png", "6"), **given) == 0
+    told = capsys.readouterr()
+    assert f"those of this one go to {results}_2" in told.err and f"written to {results}_2" in told.out
+    one, other = (np.loadtxt(folder / "trajectory.tum")[:, 1:4] for folder in (results, Path(f"{results}_2")))
+    assert np.linalg.norm(np.diff(other, axis=0)) == pytest.approx(2.0 * np.linalg.norm(np.diff(one, axis=0)), rel=0.02)
 
 
 def test_the_log_of_an_imu_levels_a_map(walk, tmp_path):
@@ -392,7 +415,7 @@ def rig(walk, tmp_path_factory):
 def test_a_map_of_the_cameras_of_a_rig(rig, tmp_path):
     folder, poses = rig
     found = photographs(folder, {})
-    made = make_map(found.views, folder, tmp_path, ScaleMeasurement(), None, lambda *_: None)
+    made = make_map(MapRequest(found.views, folder), tmp_path)
     names = sorted(made.written.poses)
     assert len(names) >= 8 and len({name.partition("/")[0] for name in names}) == 2
     first = names[0]
@@ -542,10 +565,10 @@ def test_images_that_show_nothing_together(tmp_path, rng):
     found = photographs(tmp_path, {})
     with pytest.raises(InputError, match=r"'z\.png' is not one of the 2 photographs"):
         make_map(
-            found.views, tmp_path, tmp_path / "map", ScaleMeasurement(distance=("a.png", "z.png", 1.0)), None, print
+            MapRequest(found.views, tmp_path, ScaleMeasurement(distance=("a.png", "z.png", 1.0))), tmp_path / "map"
         )
     with pytest.raises(InputError, match=r"no two of the 2 photographs surely show the same place .*the best pair has"):
-        make_map(found.views, tmp_path, tmp_path / "map", ScaleMeasurement(), None, lambda *_: None)
+        make_map(MapRequest(found.views, tmp_path), tmp_path / "map")
     assert not (tmp_path / "map").exists(), "a map that cannot be made leaves nothing"
 
 
@@ -563,7 +586,7 @@ def test_a_map_that_cannot_be_made_leaves_what_was_there(tmp_path, rng):
     (stopped / "matches_0.db").write_text("half")
     for folder in (finished, stopped, own):
         with pytest.raises(InputError, match="no two of the 2 photographs"):
-            make_map(views, tmp_path, folder, ScaleMeasurement(), None, lambda *_: None)
+            make_map(MapRequest(views, tmp_path), folder)
     assert sorted(path.name for path in finished.iterdir()) == ["matches_0.db", "scene.toml"]
     assert [path.name for path in own.iterdir()] == ["notes.txt"]
     assert not stopped.exists()
@@ -581,7 +604,7 @@ def test_a_stopped_map_goes_on(tmp_path, rng):
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            make_map(views, tmp_path, tmp_path / "map", ScaleMeasurement(), None, tell)
+            make_map(MapRequest(views, tmp_path), tmp_path / "map", tell)
 
     stopped_at("images searched for features")
     assert not (tmp_path / "map").exists()
@@ -591,7 +614,7 @@ def test_a_stopped_map_goes_on(tmp_path, rng):
     with pycolmap.Database.open(str(path)) as database:
         database.clear_keypoints()
     with pytest.raises(InputError, match="no two of the 2 photographs"):
-        make_map(views, tmp_path, tmp_path / "map", ScaleMeasurement(), None, lambda *_: None)
+        make_map(MapRequest(views, tmp_path), tmp_path / "map")
 
 
 def test_a_page_asks_for_the_scale_in_a_line():
