@@ -10,6 +10,7 @@ import re
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,9 @@ DISTURBED_M_S2 = 2.0
 NAME_RULE = "names like 1625133000_123456789.png (seconds_nanoseconds) or 1625133000123456789.png (nanoseconds)"
 _SECONDS = re.compile(r"(?:.*\D)?(\d{9,10})_(\d{1,9})", re.ASCII)
 _NANOSECONDS = re.compile(r"(?:.*\D)?(\d{18,19})", re.ASCII)
+_DEVICE_NS = re.compile(r"(?:^|\D)(\d{12,17})$", re.ASCII)
+_DECIMAL_S = re.compile(r"(?:^|[^\d.])(\d{1,10}\.\d{1,9})$", re.ASCII)
+"""Times at the ends of names such as camera_87551170813262.png (ns) and 1311868164.363181.png (s)."""
 _COLUMNS = "counter,sec,nsec,wx,wy,wz,ax,ay,az or timestamp_ns,wx,wy,wz,ax,ay,az"
 _LARGEST_S = 2**33
 _LARGEST_RATE_RAD_S = 1000.0
@@ -109,6 +113,22 @@ def timestamp_of(name: str) -> int | None:
         return int(match[1]) * NS_PER_S + int(match[2])
     if match := _NANOSECONDS.fullmatch(stem):
         return int(match[1])
+    return None
+
+
+def time_in_name(name: str) -> int | None:
+    """When an image was taken, ns, by its name and on any clock: one that starts with the device has few digits.
+
+    None if its name holds no time.
+    """
+    time_ns = timestamp_of(name)
+    if time_ns is not None:
+        return time_ns
+    stem = PurePosixPath(name).stem
+    if match := _DEVICE_NS.search(stem):
+        return int(match[1])
+    if match := _DECIMAL_S.search(stem):
+        return int(Decimal(match[1]) * NS_PER_S)
     return None
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from spherloc.datasets import scene_file
-from spherloc.datasets.imu import NAME_RULE, ImuSamples, down_at, read_imu, timestamp_of
+from spherloc.datasets.imu import MIN_S, NAME_RULE, ImuSamples, down_at, read_imu, time_in_name
 from spherloc.errors import InputError, shorten, show
 from spherloc.formats.text_rows import finite_numbers, rows
 from spherloc.frontend.view import Gravity, View
@@ -60,7 +60,7 @@ class ImuLog:
 
 def _time_ns(view: View) -> int | None:
     """When a view was taken, as the loader states it or as the name of its image says; None if neither does."""
-    return round(view.timestamp_s * NS_PER_S) if view.timestamp_s is not None else timestamp_of(view.name)
+    return round(view.timestamp_s * NS_PER_S) if view.timestamp_s is not None else time_in_name(view.name)
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,8 @@ class GravitySettings:
             if lost:
                 remarks.append(
                     f"{len(lost)} of {len(queries)} queries have no gravity from {self.imu.file}, the first is "
-                    f"{shorten(lost[0])}: no time ({NAME_RULE}), or one in a gap or outside of the log."
+                    f"{shorten(lost[0])}: no time ({NAME_RULE}), or one in a gap or outside of the log, which needs "
+                    f"{MIN_S:g} s without a gap."
                 )
         if self.query == "truth":
             unknown = sum(view.cam_from_map is None for view in queries)

@@ -101,7 +101,7 @@ def read_table(path: Path) -> dict[str, Any]:
     with reading(path, ADVICE):
         content = read_file(path, MAX_BYTES)
     try:
-        return tomllib.loads(content.decode("utf-8"))
+        return tomllib.loads(content.decode("utf-8-sig"))
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file in UTF-8; give the path of a scene file (TOML).") from None
     except tomllib.TOMLDecodeError as error:

@@ -8,7 +8,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -88,6 +88,8 @@ class QueryResult:
     """The outcome in a sentence, followed by what speaks against a doubtful pose."""
     remarks: tuple[str, ...] = ()
     """What the front end skipped and why, in sentences."""
+    inputs: str | None = None
+    """Digest of the query's camera, gravity, true pose and size of the image file, to see whether these change."""
     cam_from_map: FloatArray | None = None
     """Estimated pose (3, 4)."""
     truth_cam_from_map: FloatArray | None = None
@@ -107,11 +109,11 @@ class QueryResult:
 _FIELDS = tuple(item.name for item in fields(QueryResult))
 _POSES = ("cam_from_map", "truth_cam_from_map")
 _WHOLE = {"index", "references", "matches", "inliers"}
-_TEXTS = {"query", "status", "gravity_source", "diagnosis", "recording", "message"}
+_TEXTS = {"query", "status", "gravity_source", "diagnosis", "recording", "message", "inputs"}
 _NEEDED = {"index", "query", "status", "message", "remarks"}
 _LATER = {
     *("gravity_source", "gravity_bound_deg", "gravity_error_deg"),
-    *("expected_rotation_error_deg", "expected_translation_error_m"),
+    *("expected_rotation_error_deg", "expected_translation_error_m", "inputs"),
 }
 """Fields that older files do not have."""
 
@@ -119,7 +121,7 @@ PLACE = ("x_m", "y_m", "z_m", "heading_deg")
 """Columns of the CSV that tell the estimated pose: the camera's position in the map's frame, metres or units of a map
 whose scale is unknown, and ``heading_deg``. Whole poses are in the trajectory."""
 _AFTER = _FIELDS.index("status") + 1
-COLUMNS = tuple(name for name in (*_FIELDS[:_AFTER], *PLACE, *_FIELDS[_AFTER:]) if name not in _POSES)
+COLUMNS = tuple(name for name in (*_FIELDS[:_AFTER], *PLACE, *_FIELDS[_AFTER:]) if name not in (*_POSES, "inputs"))
 """Columns of the CSV."""
 MIN_LEVEL = math.sin(math.radians(5.0))
 """Least horizontal part of a camera's axis, a unit vector, that has a heading."""
@@ -390,7 +392,14 @@ class ResultsLog:
 
         Raises ``InputError`` if the files cannot be written.
         """
-        kept = {name: row for name, row in self.rows.items() if row.status in POSED}
+        return self.forget([name for name, row in self.rows.items() if row.status not in POSED])
+
+    def forget(self, queries: Collection[str]) -> int:
+        """Remove the rows of these queries, so that they are done again; returns how many there were.
+
+        Raises ``InputError`` if the files cannot be written.
+        """
+        kept = {name: row for name, row in self.rows.items() if name not in queries}
         removed = len(self.rows) - len(kept)
         if removed:
             content = "".join(f"{json_line(row)}\n" for row in kept.values())

@@ -1,9 +1,11 @@
 """Localizes the query images of a map scene, one after another; while one is solved, the next one is matched."""
 
+import hashlib
 import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -13,6 +15,7 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.diagnosis import diagnose
 from spherloc.errors import InputError, SpherlocError, show
 from spherloc.estimators import estimate
+from spherloc.experiments.configuration import DIGITS
 from spherloc.experiments.results import FAILED, LOCALIZED, UNREADABLE, QueryResult
 from spherloc.frontend.view import Matches, View
 from spherloc.metrics import evaluate
@@ -90,11 +93,23 @@ def localize_by_each(
     tracking = [False] * len(hows)
     for (view, chosen), (matches, matching_ms) in _one_ahead(lambda item: _match(scene, item[0]), queries):
         row = QueryResult(places[view.name], view.name, FAILED, view.timestamp_s, matching_ms=matching_ms)
-        row = replace(row, truth_cam_from_map=_array(view.cam_from_map))
+        row = replace(row, truth_cam_from_map=_array(view.cam_from_map), inputs=inputs_of(view))
         for index in chosen:
             found, trace = _solve(scene, view, matches, row, hows[index], tracking[index])
             tracking[index] = found.status == LOCALIZED
             yield index, found, trace
+
+
+def inputs_of(view: View) -> str:
+    """A digest of what a query's result depends on: its camera, gravity, true pose and size of the image file."""
+    down, bound = (None, None) if view.gravity is None else (view.gravity.down, view.gravity.bound_rad)
+    size_bytes = 0  # of an image that is rendered when it is needed, which depends on nothing else
+    if type(view) is View:
+        with suppress(OSError):
+            size_bytes = view.path.stat().st_size
+    given = (down, bound, view.cam_from_map)
+    numbers = [None if array is None else (np.round(array, DIGITS) + 0.0).tolist() for array in given]
+    return hashlib.sha256(f"{view.camera!r} {numbers} {size_bytes}".encode()).hexdigest()[:16]
 
 
 def _match(scene: MapScene, view: View) -> tuple[Matches | SpherlocError, float]:

@@ -311,7 +311,7 @@ def _read_text(folder: Path) -> ModelParts:
 
 
 def _lines(path: Path) -> Iterator[_Line]:
-    with io.TextIOWrapper(open_file(path), encoding="utf-8", newline="\n") as file:
+    with io.TextIOWrapper(open_file(path), encoding="utf-8-sig", newline="\n") as file:
         for number, text in enumerate(iter(lambda: file.readline(_MAX_LINE), ""), start=1):
             line = _Line(path, number, text.strip())
             if len(text) == _MAX_LINE:

@@ -25,6 +25,8 @@ MAX_REFERENCES = 100
 
 _FEATURE_KEYS = {"features": "method", "max_features": "max_features", "feature_weights": "weights"}
 _MATCH_KEYS = {"matching": "method", "ratio": "ratio", "matching_weights": "weights"}
+NO_POINT = "matches have no point in the map"
+"""What a remark says of nearly every query."""
 
 
 @dataclass(frozen=True)
@@ -288,7 +290,7 @@ def _joined(
     lacking = sum(_verified_unlifted(query, part) for part in found) if lifted < min(total, FEW_LIFTED) else 0
     if lifted < total:
         but = f", though {lacking:,} of these agree with the motion between two images" if lacking else ""
-        remarks.append(f"{total - lifted:,} of {total:,} matches have no point in the map{but}.")
+        remarks.append(f"{total - lifted:,} of {total:,} {NO_POINT}{but}.")
     if not ranked:
         none, no_index = np.empty((0, 2)), np.empty(0, np.int64)
         return Matches(none, np.empty((0, 3)), tuple(tried[:most]), no_index, none, None, tuple(remarks), lacking)

@@ -1,8 +1,8 @@
 """The photographs from which a map is made: a folder's images with their cameras, or the sharpest frames of a video."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from math import ceil
 from pathlib import Path
 
@@ -35,6 +35,8 @@ UNREAD = {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gpr", ".heic", ".heif", ".i
 MAX_NAMED = 3
 """Largest number of names in a remark."""
 CALIBRATIONS = (".yaml", ".yml", ".json", ".toml", ".txt")
+CALLED_CALIBRATION = re.compile("calib|camera|camchain|intrinsic|sensor|lens|cam[0-9]*$")
+"""Names of files that are taken for calibrations, so that one that cannot be read is told."""
 MAX_CALIBRATIONS = 20
 """Largest number of files beside the photographs that are tried as a calibration."""
 SHARPNESS_PX = 512
@@ -120,17 +122,20 @@ def with_cameras(
     known = dict(cameras)
     calibrated: dict[str, CalibratedLens] = {}
     if any(is_image(name) for name in there) or not inside:
-        known = known or _beside(folder, "")
-        views, remarks, lens = _of_folder(folder, "", cameras, known, panorama, find_lens)
+        beside = _beside(folder, "")
+        known = known or dict(beside.cameras)
+        views, remarks, lens = _of_folder(folder, "", cameras, beside, panorama, find_lens)
         calibrated |= {} if lens is None else {"": lens}
         remarks += _about_subfolders(inside)
     else:
         folders = sorted(inside)
-        shared = _of_files([folder / name for name in there], least=2)
+        shared = _of_files([folder / name for name in there], least=2).cameras
         for name in folders:
             try:
                 given, common = (_belonging(some, name, folders) for some in (cameras, shared))
-                beside = _beside(folder, name) or common
+                beside = _beside(folder, name)
+                if not beside.cameras:
+                    beside = replace(beside, cameras=common)
                 found, about, lens = _of_folder(folder, name, given, beside, panorama, find_lens)
                 calibrated |= {} if lens is None else {name: lens}
             except InputError as error:
@@ -201,7 +206,7 @@ def _of_folder(
     root: Path,
     inside: str,
     given: Mapping[str, Camera],
-    beside: Mapping[str, Camera],
+    beside: "FoundCalibrations",
     panorama: bool,
     find_lens: LensFinder | None,
 ) -> tuple[list[View], list[str], CalibratedLens | None]:
@@ -225,7 +230,7 @@ def _of_folder(
     remarks = [*_about_damaged(damaged), *_about_unread(others)]
     if not sizes:
         raise InputError(_without_photographs(folder, remarks))
-    cameras = given if given or panorama else beside
+    cameras = given if given or panorama else beside.cameras
     camera_of: dict[str, Camera] = {}
     for size, names in sizes.items():
         found, about = _with_cameras(names, size, cameras)
@@ -238,6 +243,8 @@ def _of_folder(
     used = [name for name, camera in cameras.items() if any(camera is one for one in camera_of.values())]
     if used and not given:
         remarks.append(f"The calibration found beside them: {', '.join(map(shorten, used))}.")
+    unused = [] if given or used or panorama else beside.unused(sizes)
+    remarks += unused
     rest = sorted(name for names in sizes.values() for name in names if name not in camera_of)
     lens: CalibratedLens | None = None
     if rest and not camera_of and not given:
@@ -247,11 +254,12 @@ def _of_folder(
         put_it = advice("calibration").format(files=files)
         unknown = f"{folder}: its photographs, {told}, are not full panoramas (2 to 1)"
         if find_lens is None:
-            raise InputError(f"{unknown}; {put_it}.")
+            raise InputError(" ".join((f"{unknown}; {put_it}.", *unused)))
         try:
             lens = find_lens([folder / name for name in sizes[order[0]]], order[0])
         except InputError as error:
-            raise InputError(f"{unknown} and have no calibration, and {error}. Or {put_it}.") from None
+            none = "have no calibration that can be used" if unused else "have no calibration"
+            raise InputError(" ".join((f"{unknown} and {none}, and {error}. Or {put_it}.", *unused))) from None
         camera_of = dict.fromkeys(sizes[order[0]], lens[0])
         rest = [name for name in rest if name not in camera_of]
         remarks.append(lens[1])
@@ -305,17 +313,41 @@ def _is_in(camera: str, image: str) -> bool:
     return re.search(f"(?<![a-z0-9]){re.escape(word)}(?![{after}])", plain) is not None
 
 
-def _beside(root: Path, inside: str) -> dict[str, Camera]:
+@dataclass(frozen=True)
+class FoundCalibrations:
+    """What calibration files beside images hold."""
+
+    cameras: Mapping[str, Camera]
+    """By the name of the file or, if it has several, of the camera in it."""
+    refused: tuple[str, ...] = ()
+    """Why files are not read that are called as calibrations are, a sentence each."""
+
+    def unused(self, sizes: Collection[tuple[int, int]]) -> list[str]:
+        """Why none of it is used for images of these sizes, a sentence each."""
+        others = [
+            f"{shorten(name)} is of {camera.width} x {camera.height}"
+            for name, camera in self.cameras.items()
+            if (camera.width, camera.height) not in sizes
+        ]
+        if not others:
+            return list(self.refused[:MAX_NAMED])
+        told = (
+            f"The calibration beside them is not used ({', '.join(others[:MAX_NAMED])} pixels), as no photograph there"
+        )
+        return [f"{told} has its size: scale it to that of the photographs.", *self.refused[:MAX_NAMED]]
+
+
+def _beside(root: Path, inside: str) -> FoundCalibrations:
     """Cameras of the calibration files in a folder, and of one beside it that has its name."""
     files = [root / inside / name for name in names_in(root / inside)]
     files += [root / name for name in names_in(root) if inside and Path(name).stem == inside]
     return _of_files(files)
 
 
-def _of_files(files: Sequence[Path], least: int = 1) -> dict[str, Camera]:
-    """Cameras of those of the files that are calibrations of at least so many cameras, by the name of the file or, if
-    it has several, of the camera in it."""
+def _of_files(files: Sequence[Path], least: int = 1) -> FoundCalibrations:
+    """What those of the files hold that are calibrations of at least so many cameras."""
     found: dict[str, Camera] = {}
+    refused = []
     for path in [path for path in files if path.suffix.lower() in CALIBRATIONS][:MAX_CALIBRATIONS]:
         try:
             names = camera_names(path)
@@ -323,9 +355,10 @@ def _of_files(files: Sequence[Path], least: int = 1) -> dict[str, Camera]:
                 found |= {name: load_camera(path, name) for name in names}
             elif least <= 1:
                 found[path.stem] = load_camera(path)
-        except SpherlocError:  # not a calibration
-            continue
-    return found
+        except SpherlocError as error:  # not a calibration, but for its name
+            if CALLED_CALIBRATION.search(path.stem.lower()):
+                refused.append(f"A file beside them is not used: {error}")
+    return FoundCalibrations(found, tuple(refused))
 
 
 def _about_damaged(names: Sequence[str]) -> list[str]:

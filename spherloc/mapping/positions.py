@@ -4,24 +4,22 @@ The map's camera centres are aligned with these positions by a similarity. Up to
 similarity has the least median of distances (Rousseeuw 1984) and is then fitted to the positions near it.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from decimal import Decimal
 from itertools import combinations
 from math import comb
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from spherloc.datasets.imu import NAME_RULE, timestamp_of
+from spherloc.datasets.imu import NAME_RULE, time_in_name
 from spherloc.errors import InputError, shorten, show
 from spherloc.files import open_file, reading
 from spherloc.formats.text_rows import finite_numbers, rows
 from spherloc.frontend.view import View
-from spherloc.trajectory import NS_PER_S, Trajectory, pose_at, read_euroc, read_tum
+from spherloc.trajectory import Trajectory, pose_at, read_euroc, read_tum
 from spherloc.types import BoolArray, FloatArray
 
 MIN_POSITIONS = 4
@@ -38,9 +36,6 @@ _GPS_WORDS = ({"lat", "latitude"}, {"lon", "lng", "long", "longitude"}, {"alt", 
 _EQUATOR_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
 """Equatorial radius and flattening of the Earth (WGS 84)."""
 _GPS_TAGS = 0x8825
-_DEVICE_NS = re.compile(r"(?:^|\D)(\d{12,17})$", re.ASCII)
-_DECIMAL_S = re.compile(r"(?:^|[^\d.])(\d{1,10}\.\d{1,9})$", re.ASCII)
-"""Times at the ends of names such as camera_87551170813262.png (ns) and 1311868164.363181.png (s)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,22 +99,11 @@ def _of_trajectory(path: Path, views: Sequence[View]) -> dict[str, FloatArray]:
 def _at_times(trajectory: Trajectory, views: Sequence[View]) -> dict[str, FloatArray]:
     found = {}
     for view in views:
-        time_ns = _time_ns(view.name)
+        time_ns = time_in_name(view.name)
         pose = None if time_ns is None else pose_at(trajectory, time_ns, MAX_GAP_S)
         if pose is not None:
             found[view.name] = pose[:, 3]
     return found
-
-
-def _time_ns(name: str) -> int | None:
-    """When an image was taken, ns, by its name and on any clock: one that starts with the device has few digits."""
-    time_ns = timestamp_of(name)
-    if time_ns is not None:
-        return time_ns
-    match = _DEVICE_NS.search(PurePosixPath(name).stem) or _DECIMAL_S.search(PurePosixPath(name).stem)
-    if match is None:
-        return None
-    return int(match[1]) if match.re is _DEVICE_NS else int(Decimal(match[1]) * NS_PER_S)
 
 
 def _is_number(word: str) -> bool:

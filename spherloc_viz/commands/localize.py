@@ -29,7 +29,7 @@ from spherloc.experiments.results import (
     SequenceResults,
     folder_for,
 )
-from spherloc.experiments.sequence import INITIALISED, How, chosen_queries, localize_by_each
+from spherloc.experiments.sequence import INITIALISED, How, chosen_queries, inputs_of, localize_by_each
 from spherloc.experiments.summary import (
     SuccessRate,
     Summary,
@@ -42,6 +42,7 @@ from spherloc.experiments.summary import (
 )
 from spherloc.experiments.sweep_rows import csv_line
 from spherloc.frontend.gravity_from_lines import why_not_found
+from spherloc.frontend.pipeline import NO_POINT
 from spherloc.frontend.view import View
 from spherloc.trace import Trace
 from spherloc.trajectory import write_tum
@@ -211,12 +212,22 @@ def _todo(scene: MapScene, chosen: Sequence[View], log: ResultsLog, retry_failed
         )
     if log.repaired:
         say(f"{log.folder}: removed a half written line; its query is done again.")
+    changed = [view.name for view in chosen if view.name in log.rows and _has_changed(view, log.rows[view.name])]
+    if changed:
+        log.forget(changed)
+        some = f"{shorten(changed[0])}{f' and {len(changed) - 1} more' if len(changed) > 1 else ''}"
+        say(f"{log.folder}: the image, camera, gravity or true pose of {some} has changed: done again.")
     if retry_failed and (again := log.forget_failures()):
         say(f"{log.folder}: queries without a pose that are done again: {again}.")
     todo = [view for view in chosen if view.name not in log.rows]
     if len(todo) < len(chosen):
         say(f"{log.folder}: {len(chosen) - len(todo)} of {len(chosen)} queries are done already.")
     return todo
+
+
+def _has_changed(view: View, row: QueryResult) -> bool:
+    """Whether a query is not what it was when its result was made; unknown for results of earlier versions."""
+    return row.inputs is not None and row.inputs != inputs_of(view)
 
 
 def _work(
@@ -327,7 +338,10 @@ def _text(results: SequenceResults, summary: Summary) -> str:
             f"{summary.median_estimating_ms:.1f} ms for estimating"
         )
     lines += [f"  {line}" for line in (*gravity_by_source(results.rows), *_without_lines(results.rows))]
-    lines += [f"  {line}" for line in (*_skipped(summary), *_each(results), *_without_pose(results.rows))]
+    lines += [
+        f"  {line}"
+        for line in (*_skipped(summary), *_each(results), *_without_pose(results.rows), *_remarks(results.rows))
+    ]
     if not timed(results):
         lines.append("  trajectory: times are places in the sequence, as the queries have no growing times")
     if (picture := results.folder / PICTURE).exists():
@@ -405,6 +419,21 @@ def _without_lines(rows: Sequence[QueryResult]) -> Iterator[str]:
         yield f"no gravity from lines of {query}: {why}"
     if len(reasons) > MAX_TOLD:
         yield f"no gravity from lines of {len(reasons) - MAX_TOLD} more, see results.csv"
+
+
+def _remarks(rows: Sequence[QueryResult]) -> Iterator[str]:
+    """Lines on what was wrong with the files or the gravity of queries, each of which may be of several queries."""
+    about: dict[str, list[str]] = {}
+    for row in rows:
+        known = (NO_POINT, INITIALISED) if row.status in POSED else (INITIALISED,)
+        for remark in row.remarks:
+            if not why_not_found(remark) and not any(word in remark for word in known):
+                about.setdefault(remark, []).append(row.query)
+    for remark, queries in list(about.items())[:MAX_TOLD]:
+        more = f" and {len(queries) - 1} more" if len(queries) > 1 else ""
+        yield f"{queries[0]}{more}: {remark.removesuffix('.')}"
+    if len(about) > MAX_TOLD:
+        yield f"and {len(about) - MAX_TOLD} more remarks, see results.csv"
 
 
 def _rate(rate: SuccessRate, unit: str) -> str:

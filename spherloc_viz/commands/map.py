@@ -299,12 +299,15 @@ def distance_of(words: Sequence[str]) -> tuple[str, str, float] | None:
         return None
     try:
         first, second, metres = words
-        return first, second, float(metres)
+        found = first, second, float(metres)
     except ValueError:
         raise InputError(
             f"--distance is {show(' '.join(words))}; give two images and the metres between them, after the folder, "
             "such as --distance 1.jpg 5.jpg 12.5."
         ) from None
+    if first == second:
+        raise InputError(f"--distance names {show(first)} twice; give two images and the metres between them.")
+    return found
 
 
 def scale_of_words(words: str) -> ScaleMeasurement:

@@ -19,10 +19,13 @@ import pytest
 from sequence_samples import true_pose, write_scene
 
 from spherloc import registry
+from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import SpherlocError
 from spherloc.experiments import read_results
+from spherloc.experiments.sequence import inputs_of
+from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.scene_files import MODEL, SCENE
 from spherloc.trajectory import read_tum
 from spherloc.warm_up import warm_up
@@ -195,12 +198,60 @@ def test_failures_are_done_again_when_asked(tmp_path: Path, capsys: pytest.Captu
     scene, out = write_scene(tmp_path, queries=3, broken=[1]), tmp_path / "out"
     assert run(scene, out) == 1
     first = table(out)
+    assert run(scene, out) == 1 and "again" not in capsys.readouterr().err
+    assert run(scene, out, retry_failed=True) == 1
+    assert "queries without a pose that are done again: 1." in capsys.readouterr().err
     (tmp_path / "images" / "image1.png").write_bytes((tmp_path / "images" / "image0.png").read_bytes())
-    assert run(scene, out) == 1
-    assert run(scene, out, retry_failed=True) == 0
+    assert run(scene, out) == 0 and "of image1.png has changed" in capsys.readouterr().err
     assert [row["status"] for row in table(out)] == ["localized"] * 3
     assert table(out)[0] == first[0]
-    assert "queries without a pose that are done again: 1." in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("drawn")
+def test_a_query_that_has_changed_is_done_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The others stay as they are, and so do results of versions that did not note what they depend on."""
+    scene, out = write_scene(tmp_path, queries=3), tmp_path / "out"
+    assert run(scene, out) == 0
+    rows = [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()]
+    now = [row["inputs"] for row in rows]
+    assert all(now) and len(set(now)) == 3
+
+    def again(*before: str | None) -> str:
+        for row, inputs in zip(rows, before, strict=True):
+            row.pop("inputs", None)
+            row |= {} if inputs is None else {"inputs": inputs}
+        (out / "results.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows))
+        assert run(scene, out) == 0
+        assert [row.status for row in read_results(out).rows] == ["localized"] * 3
+        return capsys.readouterr().err
+
+    told = again(now[0], "0" * 16, now[2])
+    assert f"gravity or true pose of {rows[1]['query']} has changed: done again" in told
+    assert "2 of 3 queries are done already" in told and [row.inputs for row in read_results(out).rows] == now
+    told = again(None, "0" * 16, "1" * 16)
+    assert f"true pose of {rows[1]['query']} and 1 more has changed" in told and "1 of 3 queries are done" in told
+
+
+def test_what_a_result_depends_on_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(b"1234")
+    camera = KannalaBrandt(400, 300, 90.0, 90.0, 200.0, 150.0, (0.0, 0.0, 0.0, 0.0))
+    down = np.array([0.0, 1.0, 0.0])
+    view = View("a.png", camera, path, np.eye(3, 4), Gravity(down, "the IMU", 0.01))
+    others = (
+        replace(view, camera=replace(camera, fx=91.0)),
+        replace(view, cam_from_map=np.eye(3, 4) + 0.01),
+        replace(view, cam_from_map=None),
+        replace(view, gravity=Gravity(-down, "the IMU", 0.01)),
+        replace(view, gravity=Gravity(down, "the IMU", 0.02)),
+        replace(view, gravity=None),
+        replace(view, path=tmp_path / "none.png"),
+    )
+    assert len({inputs_of(one) for one in (view, *others)}) == 1 + len(others)
+    assert inputs_of(view) == inputs_of(replace(view, name="b.png", gravity=Gravity(down + 1e-9, "another", 0.01)))
+    before = inputs_of(view)
+    path.write_bytes(b"12345")
+    assert inputs_of(view) != before
 
 
 @pytest.mark.usefixtures("drawn")
