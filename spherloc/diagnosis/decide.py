@@ -33,6 +33,8 @@ MIN_SUPPORT = 4
 MIN_RIGHT_RATE = 0.04
 """Least share of right matches that a right reference image gives: if no pose stands out although this share of the
 matches would, the reference is wrong. Without the truth nothing else distinguishes this from too few inliers."""
+MAX_FEW = 20
+"""Of so few matches none may be right, whatever they were matched with."""
 SPREAD = 1.5
 """The bound is too small if within twice the bound there are this many times more matches than within it: so it is with
 a noise of 0.75 times the bound."""
@@ -114,7 +116,7 @@ def with_truth(e: Evidence, t: Truth) -> Cause:
     if not many and map_is_sparse(e, right):
         return Cause.MAP_TOO_SPARSE
     if right < 1 or right <= t.by_chance + CHANCE_SDS * np.sqrt(t.by_chance):
-        return Cause.WRONG_REFERENCE
+        return Cause.WRONG_REFERENCE if len(t.right) > MAX_FEW else Cause.TOO_FEW_INLIERS
     if not many:
         return Cause.TOO_FEW_INLIERS
     if undetermined(t.rotation_sd_rad, t.position_sd_m):

@@ -52,6 +52,8 @@ def describe(
     )
 
 
+SURE_NFA = 1e-6
+"""Largest NFA of a consensus that speaks against a stated truth."""
 FAR = 3.0
 """Number of noise bounds beyond which the errors of most right matches are not noise."""
 
@@ -65,6 +67,11 @@ def _advice(trace: Trace, e: Evidence, truth: Truth | None, cause: Cause) -> str
                 f"Calibrate better: half of the right matches are {off_px:.0f} px off or more at the true pose, and a "
                 "bound as wide lets wrong ones in."
             )
+    if cause is Cause.WRONG_REFERENCE and _contradicts(e, truth):
+        return (
+            "Check the true pose first: its direction (camera from map), the order of its quaternion, its units and "
+            "frame. If it is right, look for places in the map that look alike."
+        )
     if cause is Cause.GRAVITY_OFF and e.believed_rad < e.aligned.gravity_bound_rad:
         return "Set gravity_sd_deg to what the problem states, or leave it out; then the refinement corrects the tilt."
     if cause is Cause.FALSE_CONSENSUS and truth is None and not _strong(e):
@@ -72,6 +79,12 @@ def _advice(trace: Trace, e: Evidence, truth: Truth | None, cause: Cause) -> str
     if cause is Cause.SEARCH_MISSED and trace.stage(ConsensusStage) is not None:
         return "Raise the effort and the time budget."
     return ADVICE[cause]
+
+
+def _contradicts(e: Evidence, truth: Truth | None) -> bool:
+    """Whether the matches speak for another pose than the true one, by which none of them is right."""
+    best = 0 if e.best is None else e.best.support(e.bound_px)
+    return truth is not None and best > 0 and e.nfa(best) < SURE_NFA
 
 
 def _fit_beside(e: Evidence, truth: Truth | None, cause: Cause) -> Fit | None:
@@ -105,10 +118,17 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
         case Cause.TOO_FEW_INLIERS if truth is not None:
             right = int(np.count_nonzero(truth.right))
             lucky = " The pose is right all the same, which only the truth can tell." if truth.success else ""
+            if right == 0:
+                return f"None of {total} matches is right.{lucky}"
             are = "is" if right == 1 else "are"
             return f"Only {right} of {total} matches {are} right, {_by_chance(e, right, truth.within)}.{lucky}"
         case Cause.TOO_FEW_INLIERS:
             return f"Only {best} of {total} matches agree with any pose, {_by_chance(e, best)}."
+        case Cause.WRONG_REFERENCE if _contradicts(e, truth):
+            return (
+                f"No match is right by the true pose, but {best} of {total} agree with another pose, which chance does "
+                "not explain: the reference shows another place that looks alike, or the true pose is not right."
+            )
         case Cause.WRONG_REFERENCE:
             return f"None of {total} matches seems right: {best} agree with the best pose, no more than chance gives."
         case Cause.MAP_TOO_SPARSE:
@@ -256,9 +276,9 @@ def _truths(trace: Trace, e: Evidence, truth: Truth) -> Iterator[str]:
     at, near = truth.exact.support(e.bound_px), truth.fit.support(e.bound_px)
     more = f", {near} with a pose fitted near it" if near > at else ""
     what = "match is" if right == 1 else "matches are"
-    yield f"Truth: {right} {what} right, and {at} agree with the true pose{more}."
+    yield f"Truth: {right} {what} right, and {at} agree{'s' * (at == 1)} with the true pose{more}."
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
-        error = f"{metrics.translation_error_m:.3g} {trace.problem.unit} and {metrics.rotation_error_deg:.3g}°"
+        error = f"{_distance(metrics.translation_error_m, trace.problem.unit)} and {metrics.rotation_error_deg:.3g}°"
         yield f"Truth: the run's pose is off by {error}; the known gravity by {_deg(truth.exact.tilt_rad)}."
 
 
@@ -272,4 +292,6 @@ def px_text(size_px: float) -> str:
 
 
 def _distance(distance: float, unit: str) -> str:
+    if unit == "m" and distance < 1.0:
+        return f"{100.0 * distance:.2g} cm"
     return f"{distance:.2g} {unit}" if distance < 100 else f"{distance:.0f} {unit}"

@@ -19,7 +19,7 @@ from spherloc_viz.app.plots.charts import ChartPanel
 from spherloc_viz.app.plots.graph_view import GraphView
 from spherloc_viz.app.plots.residual_view import ResidualView
 from spherloc_viz.app.plots.yaw_view import YawView
-from spherloc_viz.app.text import legend_html, opening_card_html, opening_html, summary_html, table_html
+from spherloc_viz.app.text import legend_html, opening_card_html, opening_html, stale_html, summary_html, table_html
 from spherloc_viz.app.web.touch import READY, Touch, Touches, pixels_of, seen_views
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers import graph_begins, steps
@@ -56,6 +56,7 @@ class LeftPanels:
             self.address = gui.add_html("")
             """For what the page's script is to keep as the address."""
         self._opening = self._of_step = self._asked = self._elsewhere = ""
+        self._stale = False
         self.tab = TABS[0]
         """The view that a person or a link has brought to the front, for the page's link."""
         self.side = SIDES[0]
@@ -121,6 +122,8 @@ class LeftPanels:
             self._opening = self._card.content = ""
         elif self._opening:
             summary, ending = opening_html(self._opening), f'<div style="opacity:.35">{ending}</div>'
+        elif self._stale:
+            summary = f'{stale_html()}<div style="opacity:.5">{summary}</div>'
         self._of_step = front_of(picture.step.stage, picture.step.key) or self._of_step
         front = front_html(self._of_step, self._asked, self._elsewhere)
         for widget, html in ((self._front, front), (self._summary, summary), (self._outcome, ending)):
@@ -161,6 +164,12 @@ class LeftPanels:
         """The opening has ended without a new run: show the scene before."""
         if self._opening:
             self._opening = self._card.content = ""
+            self._changed(None)
+
+    def mark_stale(self, stale: bool) -> None:
+        """Say whether the run that is shown is not that of the settings, as one of these cannot be used."""
+        if stale != self._stale:
+            self._stale = stale
             self._changed(None)
 
     def _see(self, touch: Touch) -> None:

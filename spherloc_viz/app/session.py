@@ -277,7 +277,9 @@ class Session:
         if not asked:
             return self._settle()
         try:
-            return self._solve_newest()
+            pause = self._solve_newest()
+            self._display.panels.mark_stale(False)
+            return pause
         except Cancelled:
             if self._controls.slow.stopped:
                 what = "choose another scene." if self._run is None else "the page still shows the run before."
@@ -286,6 +288,7 @@ class Session:
             return None
         except Exception:
             self._display.end_opening()
+            self._display.panels.mark_stale(True)
             raise
 
     def _solve_newest(self) -> float | None:

@@ -132,6 +132,12 @@ def opening_html(label: str) -> str:
     return box(words, "font-size:12.5px;padding-top:.2em")
 
 
+def stale_html() -> str:
+    """Text above the summary of a run that is not that of the settings."""
+    words = "<b>These settings cannot be run</b>; what is shown is the run before them."
+    return box(words, "font-size:12.5px;padding-top:.2em")
+
+
 def opening_card_html(label: str, words: str, share: float | None) -> str:
     """Has the page's script (``opening.js``) show over the canvas how far the opening of a scene is, 0 to 1, or None
     where that is not known."""

@@ -286,7 +286,7 @@ def _pairs(clique: np.ndarray) -> tuple[np.ndarray, str]:
         return drawn, f"All {len(pairs):,} pairs are drawn, as lines on the map."
     return (
         drawn,
-        f"An even sample of {len(drawn):,} of {len(pairs):,} pairs is drawn, as lines on the map.",
+        f"{len(drawn):,} of {len(pairs):,} pairs, evenly chosen, are drawn as lines on the map.",
     )
 
 

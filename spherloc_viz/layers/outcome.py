@@ -156,7 +156,9 @@ def early_table(trace: Trace, judged: Judgement | None) -> Table:
         rows.append(("position error", length(metrics.translation_error_m, trace.problem.metric)))
     refinement = trace.stage(RefinementStage)
     if refinement is not None and trace.cam_from_map is not None:
-        rows.append(("expected error", uncertainty.spread(refinement, trace.problem.metric)))
+        doubted = metrics.success is False or (judged is not None and judged.outcome is not Outcome.LOCALIZED)
+        condition = ", if its inliers are right" if doubted and refinement.expected_errors is not None else ""
+        rows.append(("expected error", uncertainty.spread(refinement, trace.problem.metric) + condition))
     inliers, explained = int(np.count_nonzero(trace.inlier_mask)), count_within_noise(trace)
     within = f", {explained} within the bound on the noise" if explained < inliers else ""
     rows.append(("inliers", f"{inliers} of {len(trace.problem)}{within}"))

@@ -89,8 +89,8 @@ def _note(balls: BallSet, shown: IntArray, inside: np.ndarray) -> str:
     parts = [balls.stage.rule]
     if len(drawn) < len(shown):
         parts.append(
-            f"{len(drawn)} of {len(shown):,} balls are drawn with the overlaps between them: an even sample of the "
-            "smaller half of the clique, and of the others; of the rest only the centres."
+            f"{len(drawn)} of {len(shown):,} balls are drawn with the overlaps between them, evenly chosen from the "
+            "smaller half of the clique and from the others; of the rest only the centres."
         )
     solid = np.count_nonzero(balls.solid(drawn, inside))
     if solid < len(drawn):

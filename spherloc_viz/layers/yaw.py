@@ -450,7 +450,7 @@ def _clique(view: RunView, arcs: StageArcs) -> Frame:
     turned, count = view.standing(yaw_rotation(stage.yaw_rad)), len(arcs)
     note = f"The more of its arcs are in the clique, the more gold a match is. {stage.rule}".strip()
     if len(drawn) < count:
-        note += f" An even sample of {len(drawn)} of {count:,} arcs is drawn, half of them from the clique."
+        note += f" {len(drawn)} of {count:,} arcs, evenly chosen, are drawn, half of them from the clique."
     interval = np.degrees(stage.best_rad[1] - stage.best_rad[0])
     off = ring.off_truth(view, stage.yaw_rad)
     error_deg = evaluate(view.trace).rotation_error_deg

@@ -391,10 +391,13 @@ def test_mistakes_are_sentences_and_the_page_stays_usable(tab: Playground, addre
         expect(note).to_be_visible()
         assert note.inner_text().endswith(".") and note.inner_text().count(". ") == 0
         expect(tab.value("outcome")).to_have_text("success")
+        expect(stale).to_be_visible()
         tab.type(label, right)
         mended()
+        expect(stale).to_have_count(0)
         expect(note).to_have_count(0)
 
+    stale = tab.page.get_by_text("These settings cannot be run; what is shown is the run before them.")
     error = tab.value("rotation error").inner_text()
     changed = lambda: expect(tab.value("rotation error")).not_to_have_text(error)  # noqa: E731
     mistake("Seed", "soon", "The seed 'soon' is not a whole number", "8", changed)

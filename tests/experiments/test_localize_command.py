@@ -198,7 +198,7 @@ def test_failures_are_done_again_when_asked(tmp_path: Path, capsys: pytest.Captu
     scene, out = write_scene(tmp_path, queries=3, broken=[1]), tmp_path / "out"
     assert run(scene, out) == 1
     first = table(out)
-    assert run(scene, out) == 1 and "again" not in capsys.readouterr().err
+    assert run(scene, out) == 1 and "done again" not in capsys.readouterr().err
     assert run(scene, out, retry_failed=True) == 1
     assert "queries without a pose that are done again: 1." in capsys.readouterr().err
     (tmp_path / "images" / "image1.png").write_bytes((tmp_path / "images" / "image0.png").read_bytes())

@@ -184,7 +184,7 @@ def _filters(rows: MatchColumns, look: TableLook) -> str:
 def _headings(rows: MatchColumns, look: TableLook) -> str:
     cells = []
     is_sample = rows.partners < np.count_nonzero(rows.kept)
-    asked = f"{rows.partners} inliers, an even sample," if is_sample else f"{rows.partners} inliers"
+    asked = f"{rows.partners} inliers, evenly chosen," if is_sample else f"{rows.partners} inliers"
     for place, (name, heading, hint) in enumerate(COLUMNS):
         if name == "agrees" and rows.partners:
             heading = f"agrees /{rows.partners}"
@@ -225,5 +225,5 @@ def _number(value: float) -> str:
 
 def _pages(rows: MatchColumns, listed: IntArray, look: TableLook) -> str:
     inliers = np.count_nonzero(rows.kept)
-    asked = f"; agrees: of {'an even sample of ' if rows.partners < inliers else ''}{rows.partners} inliers"
+    asked = f"; agrees: of {rows.partners} inliers{', evenly chosen' if rows.partners < inliers else ''}"
     return pages_html(look.page, len(listed), "match-page", asked if rows.partners else "")

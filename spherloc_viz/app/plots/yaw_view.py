@@ -456,7 +456,7 @@ def caption(trace: Trace, story: YawStory, arcs: PairArcs, bars: ArcBars) -> str
     if shown < total:
         kinds = np.bincount(bars.kind[bars.owner[in_window]], minlength=len(bars.kinds)).tolist()
         counts = ", ".join(f"{n:,} of {of:,} {name}" for n, of, name in zip(kinds, bars.total, bars.kinds, strict=True))
-        rule = f"{shown:,} of {total:,} arcs in this window shown, an even sample: {counts}."
+        rule = f"{shown:,} of {total:,} arcs in this window shown, evenly chosen: {counts}."
     else:
         counts = ", ".join(f"{of:,} {name}" for of, name in zip(bars.total, bars.kinds, strict=True))
         rule = f"All {total:,} arcs" if total > 1 else "The only arc"
