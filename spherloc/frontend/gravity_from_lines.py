@@ -131,8 +131,16 @@ def gravity_of_pixels(image: ByteArray, camera: Camera, usable: BoolArray, near:
 
     ``near`` (3,) is the expected direction. Raises ``InputError``, which names the image, for too few vertical edges.
     """
+    return gravity_of_lines(image_lines(image, camera, usable), near, name)
+
+
+def gravity_of_lines(lines: Lines, near: FloatArray, name: str) -> Gravity:
+    """Gravity by the edges of an image called ``name``; ``near`` (3,) is the expected direction.
+
+    Raises ``InputError``, which names the image, for too few vertical edges.
+    """
     try:
-        found = vertical(image_lines(image, camera, usable), near)
+        found = vertical(lines, near)
     except InputError as error:
         raise InputError(f"{shorten(name)}: {NOT_FOUND} {error}") from None
     return Gravity(found.down, SOURCE, BOUND_SD * found.sd_rad, found.sd_rad)

@@ -16,6 +16,8 @@ COMMAND = {
     "other folder": "give another --output",
     "go on": "make room there and give the same command, which goes on with what is done",
     "report again": "make room there and give the same command for the report",
+    "sideways": "--gravity FILE says where down is",
+    "another map": "give another folder with --output, or remove that one",
 }
 PAGE = {
     "calibration": "put {files} beside them, into that folder, and make the map again",
@@ -29,6 +31,8 @@ PAGE = {
     "other folder": "make that folder writable, or open the photographs in another one",
     "go on": "make room there and make the map again, which goes on with what is done",
     "report again": "make room there and make the map again for the report",
+    "sideways": "if so, make the map with the command spherloc map, which takes a file of gravity",
+    "another map": "remove that folder, or rename that of the photographs",
 }
 _words: ContextVar[Mapping[str, str]] = ContextVar("advice", default=COMMAND)
 

@@ -16,8 +16,7 @@ from spherloc.frontend.features import Features, extract
 from spherloc.frontend.masks import around
 from spherloc.frontend.matching import match
 from spherloc.frontend.view import View
-from spherloc.mapping.parallel import as_completed
-from spherloc.mapping.upright import Tell
+from spherloc.mapping.parallel import Tell, as_completed
 from spherloc.types import BoolArray, FloatArray
 
 BELOW_DEG = 60.0

@@ -19,7 +19,8 @@ from spherloc.estimators import default_options, estimate
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN
 from spherloc.mapping.model import Reconstruction, contradictions, points_of
-from spherloc.mapping.upright import Level, Tell, arbitrary_scale
+from spherloc.mapping.parallel import Tell
+from spherloc.mapping.upright import Level, arbitrary_scale
 from spherloc.outcome import Outcome, judge
 from spherloc.problem import Problem
 from spherloc.registry import require

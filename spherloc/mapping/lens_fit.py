@@ -21,9 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.mapping.image_circle import Circle
-from spherloc.mapping.parallel import as_completed
+from spherloc.mapping.parallel import Tell, as_completed
 from spherloc.mapping.telling import far_rotation, unmoved
-from spherloc.mapping.upright import Tell
 from spherloc.types import BoolArray, FloatArray, IntArray
 
 PixelPairs = tuple[FloatArray, FloatArray]

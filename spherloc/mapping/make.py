@@ -12,19 +12,18 @@ from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.carried import carried_nadir_deg
 from spherloc.mapping.later import place_rest
+from spherloc.mapping.line_gravity import GravityByLines, gravity_by_lines
 from spherloc.mapping.model import Reconstruction
+from spherloc.mapping.parallel import Tell
 from spherloc.mapping.photographs import NewImages
 from spherloc.mapping.positions import Positions, gps_of_images
 from spherloc.mapping.reconstruction import DATABASES, reconstruct
 from spherloc.mapping.scene_files import SCENE
 from spherloc.mapping.stated_gravity import StatedGravity
 from spherloc.mapping.upright import (
-    GravityByLines,
     Level,
     MapScale,
-    Tell,
     arbitrary_scale,
-    gravity_by_lines,
     level_of,
     scale_by_distance,
     scale_by_height,
@@ -147,9 +146,12 @@ def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
         masks = replace(masks or Masks(), nadir_deg=carried_deg)
     kept = Kept(masks, request.how, stated)
     known = {} if stated is None else stated.found
-    lines = gravity_by_lines([view for view in views if view.name not in known], tell)
+    lines = gravity_by_lines(views, tell, known)
     gravity = {**known, **lines.found}
     first, *others = reconstruct(views, [gravity.get(view.name) for view in views], folder, tell, request.how)
+    if lines.sideways:
+        lines = lines.turned_down(first.poses, first.points())
+        gravity = {**known, **lines.found}
     found = _finished(first, views, nearer_to_others(first, others), gravity, measured, tell)
     inside = set(found[0].poses)
     written = write_map(*found, views, request.images, folder, request.new_images, kept)

@@ -9,6 +9,8 @@ from spherloc.processors import processor_count
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
+Tell = Callable[[str, int, int], None]
+"""Called after each piece of work: with its kind in the plural, how many are done, and how many there are."""
 MAX_WORKERS = 4
 
 

@@ -34,10 +34,9 @@ from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.model import Reconstruction, parted, registered, untangled, worth
 from spherloc.mapping.pairs import MIN_MATCHES, ImagePairs, relative
-from spherloc.mapping.parallel import as_completed
+from spherloc.mapping.parallel import Tell, as_completed
 from spherloc.mapping.rotations import agreeing
 from spherloc.mapping.triangles import Pair, open_triangles
-from spherloc.mapping.upright import Tell
 from spherloc.registry import require
 from spherloc.types import BoolArray, FloatArray
 

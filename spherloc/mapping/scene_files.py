@@ -10,8 +10,11 @@ from typing import Any
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import load_camera
-from spherloc.errors import SpherlocError
+from spherloc.datasets.scene_file import read_table
+from spherloc.errors import InputError, SpherlocError
+from spherloc.files import is_file, is_folder
 from spherloc.frontend.view import View
+from spherloc.mapping.advice import advice
 from spherloc.mapping.photographs import CalibratedLens, NewImages, cameras_of
 
 MODEL = "model"
@@ -113,6 +116,19 @@ def kept_lens(path: Path) -> Camera | None:
         return load_camera(path)
     except SpherlocError:
         return None
+
+
+def check_images_of(folder: Path, images: Path) -> None:
+    """Raise ``InputError`` if there is a map in ``folder`` of photographs that are not in the folder ``images``."""
+    scene = folder / SCENE
+    if not is_file(scene):
+        return
+    known = read_table(scene).get("images")
+    if not isinstance(known, str):
+        return
+    there = (folder / known).resolve()
+    if there != images.resolve() and is_folder(there):
+        raise InputError(f"{folder}: holds the map of other photographs, those in {there}; {advice('another map')}.")
 
 
 def write_lenses(folder: Path, lenses: Mapping[str, CalibratedLens]) -> None:

@@ -15,8 +15,7 @@ from spherloc.frontend.view import View
 from spherloc.images import read_image
 from spherloc.mapping.image_circle import Circle, image_circle
 from spherloc.mapping.lens_fit import PixelPairs, fit_lens
-from spherloc.mapping.parallel import as_completed
-from spherloc.mapping.upright import Tell
+from spherloc.mapping.parallel import Tell, as_completed
 from spherloc.registry import require
 from spherloc.types import BoolArray
 

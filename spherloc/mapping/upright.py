@@ -1,7 +1,7 @@
 """Gravity and scale of a model that was made from images alone."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,16 +10,12 @@ from scipy.spatial import KDTree
 
 from spherloc.errors import InputError, show
 from spherloc.frontend.gravity_from_lines import SOURCE as LINES
-from spherloc.frontend.gravity_from_lines import gravity_from_lines, why_not_found
-from spherloc.frontend.view import Gravity, View
+from spherloc.frontend.view import Gravity
 from spherloc.geometry import DOWN, align_to_down, camera_centre
 from spherloc.mapping.advice import advice
-from spherloc.mapping.parallel import as_completed
+from spherloc.mapping.line_gravity import middle
 from spherloc.mapping.positions import MAX_SCALE_SD, Positions, overlaid
 from spherloc.types import FloatArray
-
-Tell = Callable[[str, int, int], None]
-"""Called after each piece of work: with its kind in the plural, how many are done, and how many there are."""
 
 MIN_LINES = 3
 """Least number of images whose lines give gravity; if there are fewer, all images count as held upright."""
@@ -74,38 +70,6 @@ class MapScale:
         return {name: off for name, off in sorted(self.off_m.items(), key=lambda item: -item[1]) if off > limit_m}
 
 
-@dataclass(frozen=True)
-class GravityByLines:
-    """What the vertical lines of images tell of gravity, by the name of the image: each is in one of both."""
-
-    found: dict[str, Gravity]
-    why_not: dict[str, str]
-    """Why lines gave no gravity, in a part of a sentence such as "it has 3 straight edges, fewer than 5."."""
-
-
-def gravity_by_lines(views: Sequence[View], tell: Tell) -> GravityByLines:
-    """Gravity of those images whose vertical lines show it, and the reasons of the others.
-
-    ``tell`` is called after each image.
-    """
-
-    def measure(view: View) -> Gravity | str:
-        try:
-            return gravity_from_lines(view)
-        except InputError as error:
-            return why_not_found(str(error)) or str(error)
-
-    measured: dict[str, Gravity | str] = {}
-    for done, (view, one) in enumerate(as_completed(measure, views), start=1):
-        measured[view.name] = one
-        tell("images searched for vertical lines", done, len(views))
-    ordered = {view.name: measured[view.name] for view in views}
-    return GravityByLines(
-        {name: one for name, one in ordered.items() if isinstance(one, Gravity)},
-        {name: one for name, one in ordered.items() if isinstance(one, str)},
-    )
-
-
 def level_of(poses: Mapping[str, FloatArray], gravity: Mapping[str, Gravity]) -> Level:
     """Gravity of the model, from that of the images, else as the mean of their vertical axes.
 
@@ -117,7 +81,7 @@ def level_of(poses: Mapping[str, FloatArray], gravity: Mapping[str, Gravity]) ->
     sources = Counter(gravity[name].source for name in measured)
     is_measured = len(measured) >= MIN_LINES or sources[LINES] < len(measured)
     directions = measured if is_measured else axes
-    down = _middle(np.stack(list(directions.values())))
+    down = middle(np.stack(list(directions.values())))
     off_deg = {name: float(np.degrees(np.arccos(min(1.0, one @ down)))) for name, one in directions.items()}
     spread_deg = float(np.median(list(off_deg.values())))
     if spread_deg > MAX_SPREAD_DEG:
@@ -138,15 +102,6 @@ def level_of(poses: Mapping[str, FloatArray], gravity: Mapping[str, Gravity]) ->
             f"{len(poses)} images and {MIN_LINES} are needed"
         )
     return Level(down, source, spread_deg, leaning, sources[LINES] >= MIN_LINES)
-
-
-def _middle(directions: FloatArray) -> FloatArray:
-    """The unit vector with the least sum of distances to unit vectors (N, 3): Weiszfeld's iteration."""
-    middle = directions.mean(axis=0)
-    for _ in range(50):
-        weights = 1.0 / np.maximum(np.linalg.norm(directions - middle, axis=1), 1e-9)
-        middle = weights @ directions / weights.sum()
-    return middle / np.linalg.norm(middle)
 
 
 def scale_by_distance(poses: Mapping[str, FloatArray], first: str, second: str, metres: float) -> MapScale:

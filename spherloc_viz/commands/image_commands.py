@@ -2,6 +2,7 @@
 other modules of this folder."""
 
 import os
+import shlex
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
@@ -342,7 +343,7 @@ def map(
     if play:
         _play(scene)
     else:
-        print(f"see it        spherloc play {scene}")
+        print(f"see it        spherloc play {shlex.quote(str(scene))}")
     return code
 
 

@@ -34,6 +34,7 @@ from spherloc.mapping.advice import advice, for_a_page
 from spherloc.mapping.kept_scale import FILE as SCALE_FILE
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
 from spherloc.mapping.make import Map, MapRequest, ScaleMeasurement, make_map
+from spherloc.mapping.parallel import Tell
 from spherloc.mapping.photographs import (
     CalibratedLens,
     LensFinder,
@@ -45,9 +46,8 @@ from spherloc.mapping.photographs import (
     photographs,
 )
 from spherloc.mapping.positions import read_positions
-from spherloc.mapping.scene_files import LENS, MAP_FOLDER, kept_lens, lens_path, write_lenses
+from spherloc.mapping.scene_files import LENS, MAP_FOLDER, check_images_of, kept_lens, lens_path, write_lenses
 from spherloc.mapping.stated_gravity import read_stated_gravity
-from spherloc.mapping.upright import Tell
 from spherloc.registry import require
 from spherloc.types import FloatArray
 from spherloc_viz.commands.map_report import MAP_FEATURES, map_report, summary
@@ -88,6 +88,7 @@ def make(
     end_without_a_trace()
     how = how_of(features)
     target = output or Path(MAP_FOLDER.format(folder.resolve().name))
+    check_images_of(target, folder)
     with _stages() as tell, _compiled_for(new_images):
         if video is not None:
             _take_frames(*video, folder, tell)
@@ -121,7 +122,8 @@ def make(
     print("\n".join(summary(made, found)))
     print(f"report        {report}")
     if "" in found.calibrated:
-        print(f"lens          {target / LENS}, for other images of that camera: --camera {target / LENS}")
+        lens = shlex.quote(str(target / LENS))
+        print(f"lens          {target / LENS}, for other images of that camera: --camera {lens}")
     if others is not None:
         print(f"new images    {_sizes(others)}")
     if older := _of_the_map_before(target, made):
@@ -336,6 +338,7 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
     report = output / REPORT
     with for_a_page():
         try:
+            check_images_of(output, folder)
             found = photographs(folder, {}, find_lens=_lens_finder(_progress, folder, output, None))
             measured = scale_of_words(scale)
             if measured == ScaleMeasurement():

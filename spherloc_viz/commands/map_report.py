@@ -16,6 +16,7 @@ from spherloc.frontend import trained
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
 from spherloc.mapping.advice import advice
+from spherloc.mapping.line_gravity import share_below
 from spherloc.mapping.make import Map
 from spherloc.mapping.pairs import MIN_MATCHES
 from spherloc.mapping.photographs import Photographs, cameras_of
@@ -27,6 +28,10 @@ MAP_FEATURES = {
     "sift+aliked": "SIFT, and ALIKED matched by LightGlue",
 }
 """Kinds of features and what they are called."""
+UP = np.array([0.0, 0.0, 1.0])
+"""In every map that is written."""
+MOST_ABOVE = 0.65
+"""If more of the points are above the cameras, stated gravity may point up."""
 
 
 def summary(made: Map, found: Photographs) -> list[str]:
@@ -37,11 +42,21 @@ def summary(made: Map, found: Photographs) -> list[str]:
     lines = [
         f"in the map    {len(written.poses)} of {len(found.views)} images, {len(written.points):,} points, "
         f"{written.error_px:.2f} px mean error",
-        f"down          from {made.level.source}; single images differ by {made.level.spread_deg:.1f}° (median)",
+        f"down          {_down(made)}",
         *_about_lines(made),
         f"features      {about_features(made)}",
         f"scale         {made.scale.source or _units_unknown(made)}",
     ]
+    if made.lines.unsure_deg:
+        lines.append(
+            f"in doubt      whether down is right: by their lines the images lean by {made.lines.unsure_deg:.0f}° "
+            f"(median), or are stored sideways; {advice('sideways')}"
+        )
+    if made.stated and (above := 1.0 - share_below(written.poses, written.points, -UP)) > MOST_ABOVE:
+        lines.append(
+            f"in doubt      whether down is right: {100 * above:.0f} % of the points are above the cameras; the stated "
+            "gravity must point down, with x right, y down and z forward"
+        )
     if made.carried_deg:
         lines.append(f"masked        {_carried_words(made.carried_deg)}")
     if missing:
@@ -68,7 +83,15 @@ def about_features(made: Map) -> str:
 
 
 def _units_unknown(made: Map) -> str:
-    return f"units unknown; {made.scale.why_unknown or advice('any scale')}"
+    why = made.scale.why_unknown
+    if why and made.carried_deg:
+        why += f" (what was masked around straight down may be the ground{advice('carried')})"
+    return f"units unknown; {why or advice('any scale')}"
+
+
+def _down(made: Map) -> str:
+    sideways = ", which are stored sideways" if made.lines.sideways else ""
+    return f"from {made.level.source}{sideways}; single images differ by {made.level.spread_deg:.1f}° (median)"
 
 
 def _about_lines(made: Map) -> list[str]:
@@ -123,7 +146,7 @@ def map_report(made: Map, found: Photographs) -> str:
         "Images in the map": f"{len(written.poses)} of {len(views)}",
         "Points": f"{len(written.points):,}",
         "Mean reprojection error": f"{written.error_px:.2f} px",
-        "Down": f"from {made.level.source}; single images differ from it by {made.level.spread_deg:.1f}° in the median",
+        "Down": _down(made),
         "Features": MAP_FEATURES[made.features],
         **({"Masked": _carried_words(made.carried_deg)} if made.carried_deg else {}),
         "Scale": scale,

@@ -28,6 +28,7 @@ from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.advice import COMMAND, PAGE, for_a_page
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
+from spherloc.mapping.line_gravity import gravity_by_lines
 from spherloc.mapping.make import MapRequest, ScaleMeasurement, make_map, scale_of
 from spherloc.mapping.new_queries import add_new_images, map_images
 from spherloc.mapping.photographs import (
@@ -39,9 +40,9 @@ from spherloc.mapping.photographs import (
     photographs,
     two_circles,
 )
-from spherloc.mapping.scene_files import MODEL, MapHead, _camera, _queries, write_new_scene
+from spherloc.mapping.scene_files import MODEL, SCENE, MapHead, _camera, _queries, check_images_of, write_new_scene
 from spherloc.mapping.stated_gravity import read_stated_gravity
-from spherloc.mapping.upright import Level, gravity_by_lines, level_of, scale_by_height, upright_frame
+from spherloc.mapping.upright import Level, level_of, scale_by_height, upright_frame
 from spherloc.mapping.written import _gravity
 from spherloc.problem import Problem
 from spherloc_viz.commands.image_commands import map as map_command
@@ -158,6 +159,9 @@ def test_gravity_that_a_file_states_goes_before_that_of_lines(walk, tmp_path):
     made = make_map(MapRequest(found.views, images, new_images=new, stated=stated), tmp_path / "map")
     assert made.level.source == "the gravity file of 3 images and vertical lines of 2 images"
     assert sorted(made.stated) == names[:3] and sorted(made.lines.found) == names[3:]
+    assert "in doubt" not in "".join(summary(made, found))
+    up = replace(made, written=replace(made.written, points=made.written.points * [1.0, 1.0, -1.0] + [0.0, 0.0, 9.0]))
+    assert "of the points are above the cameras; the stated gravity must point down" in "".join(summary(up, found))
     page = map_report(made, found)
     assert "<td>the gravity file, at most 1.5° off</td>" in page and "<td>lines of the image, at most " in page
     for name in names:
@@ -313,6 +317,31 @@ def test_the_calibration_beside_the_photographs_is_taken(tmp_path, rng):
     found = photographs(tmp_path, {})
     assert [view.camera.width for view in found.views] == [400, 400]
     assert found.remarks == ("The calibration found beside them: b.",)
+    (tmp_path / "b.toml").unlink()
+    (tmp_path / "calibration.yaml").write_text("nothing: 1")
+    with pytest.raises(InputError, match="have no") as error:
+        photographs(tmp_path, {}, find_lens=_no_lens)
+    told = str(error.value)
+    assert "have no calibration that can be used, and they show nothing." in told and "notes" not in told
+    assert "is not used (a is of 640 x 480 pixels), as no photograph there has its size" in told
+    assert "A file beside them is not used: " in told and "calibration.yaml" in told
+
+
+def _no_lens(paths, size):
+    raise InputError("they show nothing")
+
+
+def test_a_folder_with_the_map_of_other_photographs_is_not_taken(tmp_path):
+    """Two folders of one name would have one folder for their maps; one that is gone is not missed."""
+    for name in ("monday", "tuesday", "map"):
+        (tmp_path / name).mkdir()
+    check_images_of(tmp_path / "map", tmp_path / "monday")
+    (tmp_path / "map" / SCENE).write_text('images = "../monday"')
+    check_images_of(tmp_path / "map", tmp_path / "map" / ".." / "monday")
+    with pytest.raises(InputError, match=r"holds the map of other photographs, those in .*monday; give another folder"):
+        check_images_of(tmp_path / "map", tmp_path / "tuesday")
+    (tmp_path / "monday").rmdir()
+    check_images_of(tmp_path / "map", tmp_path / "tuesday")
 
 
 def test_each_image_of_a_rig_has_its_camera(tmp_path, rng):

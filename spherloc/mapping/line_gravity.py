@@ -1,0 +1,140 @@
+"""Gravity of a map's photographs by their vertical lines, also where a headset or a car stores them sideways.
+
+One image cannot tell whether it is upright: in rooms, horizontal edges meet as well as vertical ones. Several can: held
+by one camera, vertical edges meet about where they did in the image before, and horizontal ones wherever it turned.
+"""
+
+from collections import defaultdict
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.errors import InputError
+from spherloc.frontend.gravity_from_lines import gravity_of_lines, image_lines, why_not_found
+from spherloc.frontend.view import Gravity, View
+from spherloc.geometry import DOWN, camera_centre
+from spherloc.images import grey
+from spherloc.mapping.parallel import Tell, as_completed
+from spherloc.types import FloatArray
+
+RIGHT = np.array([1.0, 0.0, 0.0])
+MIN_IMAGES = 5
+"""Least number of images that tell whether they are stored sideways."""
+STEADY_DEG = 12.0
+"""Gravity of an image is steady if it is this near to the middle of those of its camera."""
+MIN_SIDEWAYS, MAX_UPRIGHT = 0.7, 0.5
+"""Images are stored sideways if at least the first share of all is steady for it, and at most the second if they were
+upright. Of upright images of an apartment, a street and a courtyard 100 % are upright and 0 to 60 % sideways."""
+LEANING_DEG = 20.0
+"""If images lean more than that in the median and would be as steady sideways, they may be stored sideways."""
+
+
+@dataclass(frozen=True)
+class GravityByLines:
+    """What the vertical lines of images tell of gravity, by the name of the image: each is in one of both."""
+
+    found: Mapping[str, Gravity]
+    why_not: Mapping[str, str]
+    """Why lines gave no gravity, in a part of a sentence such as "it has 3 straight edges, fewer than 5."."""
+    sideways: bool = False
+    """Whether the images are stored sideways: down is at their right or left."""
+    unsure_deg: float = 0.0
+    """If they may be stored sideways: by how much they lean if they are not; else 0."""
+
+    def turned_down(self, poses: Mapping[str, FloatArray], points: FloatArray) -> "GravityByLines":
+        """The same, or the opposite if most points (N, 3) of a map, in which images have ``poses`` (3, 4), would be
+        above the camera next to them: rooms and streets have more to see below."""
+        downs = [poses[name][:, :3].T @ one.down for name, one in self.found.items() if name in poses]
+        if not downs or share_below(poses, points, np.sum(downs, axis=0)) >= 0.5:
+            return self
+        return replace(self, found={name: replace(one, down=-one.down) for name, one in self.found.items()})
+
+
+def share_below(poses: Mapping[str, FloatArray], points: FloatArray, down: FloatArray) -> float:
+    """Share of points (N, 3) that are below the camera next to them, of poses (3, 4); ``down`` is a vector (3,)."""
+    centres = np.stack([camera_centre(pose) for pose in poses.values()])
+    return float(np.mean((points - centres[KDTree(centres).query(points)[1]]) @ down > 0.0))
+
+
+def gravity_by_lines(views: Sequence[View], tell: Tell, stated: Mapping[str, Gravity] | None = None) -> GravityByLines:
+    """Gravity of those images whose vertical lines show it, and the reasons of the others.
+
+    It is searched below, but where images of the same camera have ``stated`` gravity, around that. Images that are no
+    panoramas may be stored sideways. ``tell`` is called after each image.
+    """
+    todo = [view for view in views if view.name not in (stated or {})]
+    near = _stated_directions(views, stated or {})
+    ways: dict[str, tuple[Gravity | str, Gravity | str]] = {}
+
+    def measure(view: View) -> tuple[Gravity | str, Gravity | str]:
+        down = near.get(repr(view.camera), DOWN)
+        try:
+            lines = image_lines(grey(view.read()), view.camera, view.usable_pixels())
+        except InputError as error:
+            return str(error), str(error)
+
+        def found(direction: FloatArray) -> Gravity | str:
+            try:
+                return gravity_of_lines(lines, direction, view.name)
+            except InputError as error:
+                return why_not_found(str(error)) or str(error)
+
+        return found(down), found(RIGHT)
+
+    for done, (view, both) in enumerate(as_completed(measure, todo), start=1):
+        ways[view.name] = both
+        tell("images searched for vertical lines", done, len(todo))
+    upright, sideways = ({view.name: ways[view.name][way] for view in todo} for way in (0, 1))
+    free = [v for v in todo if repr(v.camera) not in near and not isinstance(v.camera, Equirectangular)]
+    shares = _steady_share(free, upright), _steady_share(free, sideways)
+    turned = len(free) >= MIN_IMAGES and shares[0] <= MAX_UPRIGHT and shares[1] >= MIN_SIDEWAYS
+    names = {view.name for view in free} if turned else set()
+    chosen = {name: sideways[name] if name in names else one for name, one in upright.items()}
+    leaning = [np.degrees(np.arccos(min(1.0, one.down @ DOWN))) for one in _of(free, upright).values()]
+    doubt = float(np.median(leaning)) if leaning and not turned and shares[1] >= MIN_SIDEWAYS else 0.0
+    return GravityByLines(
+        {name: one for name, one in chosen.items() if isinstance(one, Gravity)},
+        {name: one for name, one in chosen.items() if isinstance(one, str)},
+        turned,
+        doubt if doubt > LEANING_DEG else 0.0,
+    )
+
+
+def _stated_directions(views: Sequence[View], stated: Mapping[str, Gravity]) -> dict[str, FloatArray]:
+    """Unit vectors (3,) of the mean stated gravity by camera."""
+    sums: dict[str, FloatArray] = {}
+    for view in views:
+        if view.name in stated:
+            key = repr(view.camera)
+            sums[key] = sums.get(key, np.zeros(3)) + stated[view.name].down
+    return {key: total / np.linalg.norm(total) for key, total in sums.items() if np.linalg.norm(total) > 0.0}
+
+
+def _of(views: Collection[View], found: Mapping[str, Gravity | str]) -> dict[str, Gravity]:
+    """What was found of these views."""
+    return {view.name: one for view in views if isinstance(one := found[view.name], Gravity)}
+
+
+def _steady_share(views: Collection[View], found: Mapping[str, Gravity | str]) -> float:
+    """Share of the views whose gravity was found and is about that of the others of their camera."""
+    by_camera: dict[str, list[View]] = defaultdict(list)
+    for view in views:
+        by_camera[repr(view.camera)].append(view)
+    steady = 0
+    for own in by_camera.values():
+        downs = [one.down for one in _of(own, found).values()]
+        if downs:
+            steady += np.count_nonzero(np.stack(downs) @ middle(np.stack(downs)) > np.cos(np.radians(STEADY_DEG)))
+    return steady / max(1, len(views))
+
+
+def middle(directions: FloatArray) -> FloatArray:
+    """The unit vector with the least sum of distances to unit vectors (N, 3): Weiszfeld's iteration."""
+    found = directions.mean(axis=0)
+    for _ in range(50):
+        weights = 1.0 / np.maximum(np.linalg.norm(directions - found, axis=1), 1e-9)
+        found = weights @ directions / weights.sum()
+    return found / np.linalg.norm(found)

@@ -1,0 +1,95 @@
+"""Gravity of photographs by their lines where they are stored sideways, as those of headsets are."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.datasets import bundled_scenes, load_scene
+from spherloc.frontend.view import Gravity, View
+from spherloc.geometry import camera_centre
+from spherloc.mapping.line_gravity import gravity_by_lines, share_below
+
+COUNT = 7
+
+
+@pytest.fixture(scope="module")
+def upright() -> list[View]:
+    """Fisheyes of a walk through an apartment, in which the camera turns."""
+    scene = load_scene(bundled_scenes()["apartment_fisheye"])
+    for view in scene.references[:COUNT]:
+        view.make_file()
+    return [View(view.name, view.camera, view.path, view.cam_from_map) for view in scene.references[:COUNT]]
+
+
+def turned(views: list[View], folder, quarters: int) -> list[View]:
+    """The same images turned counter-clockwise, with their camera and their poses."""
+    found = []
+    for view in views:
+        path = folder / f"{view.name}_{quarters}.png"
+        cv2.imwrite(str(path), np.rot90(cv2.imread(str(view.path)), quarters))
+        camera, pose = view.camera, view.cam_from_map
+        for _ in range(quarters):
+            camera = KannalaBrandt(
+                camera.height,
+                camera.width,
+                camera.fy,
+                camera.fx,
+                camera.cy,
+                camera.width - camera.cx,
+                camera.distortion,
+            )
+            pose = np.stack([pose[1], -pose[0], pose[2]])
+        found.append(View(view.name, camera, path, pose))
+    return found
+
+
+def off_deg(view: View, one: Gravity) -> float:
+    down = view.cam_from_map[:, :3] @ [0.0, 0.0, -1.0]
+    return float(np.degrees(np.arccos(np.clip(one.down @ down, -1.0, 1.0))))
+
+
+def quiet(*_) -> None:
+    """Nobody is told."""
+
+
+@pytest.mark.parametrize("quarters", [1, 3])
+def test_images_that_are_stored_sideways_tell_down_all_the_same(upright, tmp_path, quarters):
+    """Down is at their right or at their left, which the points of the map tell: most are below the cameras."""
+    views = turned(upright, tmp_path, quarters)
+    lines = gravity_by_lines(views, quiet)
+    assert lines.sideways and len(lines.found) >= 5
+    poses = {view.name: view.cam_from_map for view in views}
+    centres = np.stack([camera_centre(pose) for pose in poses.values()])
+    points = np.repeat(centres, 3, axis=0) + np.tile([[2.0, 0.0, -1.0], [0.0, 3.0, -0.5], [1.0, 1.0, 0.8]], (COUNT, 1))
+    assert share_below(poses, points, np.array([0.0, 0.0, -1.0])) == pytest.approx(2 / 3)
+    found = lines.turned_down(poses, points).found
+    assert max(off_deg(view, found[view.name]) for view in views if view.name in found) < 1.0
+    assert (found is lines.found) == (quarters == 1)
+
+
+def test_upright_images_are_not_taken_for_such(upright):
+    lines = gravity_by_lines(upright, quiet)
+    assert not lines.sideways and not lines.unsure_deg
+    assert max(off_deg(view, lines.found[view.name]) for view in upright) < 1.0
+
+
+def test_a_few_images_that_may_be_sideways_are_told_and_taken_as_upright(upright, tmp_path):
+    """One image of each of several cameras: nothing has turned, and each way is as steady as the other."""
+    views = [
+        replace(view, camera=replace(view.camera, fx=view.camera.fx + 1e-6 * k))
+        for k, view in enumerate(turned(upright, tmp_path, 1))
+    ]
+    lines = gravity_by_lines(views, quiet)
+    leans = [off_deg(view, lines.found[view.name]) for view in views if view.name in lines.found]
+    assert not lines.sideways and np.median(leans) > 45.0
+
+
+def test_gravity_that_a_file_states_shows_where_to_look_in_the_others(upright, tmp_path):
+    views = turned(upright, tmp_path, 3)
+    stated = {views[0].name: Gravity(views[0].cam_from_map[:, :3] @ [0.0, 0.0, -1.0], "the gravity file", 0.02)}
+    lines = gravity_by_lines(views, quiet, stated)
+    assert views[0].name not in lines.found and not lines.sideways and len(lines.found) >= 4
+    assert max(off_deg(view, lines.found[view.name]) for view in views[1:] if view.name in lines.found) < 1.0
