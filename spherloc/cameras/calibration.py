@@ -24,7 +24,9 @@ _ONE_CAMERA = {
     "imgw": tool_files.loc360,
     "parameter": tool_files.adapter,
     "Camera": tool_files.stella,
+    "intrinsics": tool_files.euroc,
     "distortion_coefficients": opencv,
+    "D": opencv,
 }
 """Readers of YAML files of one camera without a name, by the top-level key by which the kind is recognised."""
 

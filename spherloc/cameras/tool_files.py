@@ -267,6 +267,18 @@ def camera_of(name: str, table: Any) -> Camera:
         return build(table, *size_of(table, "resolution"))
 
 
+_EUROC_LENSES = {"radial-tangential": "radtan"}
+"""Names of ``distortion_model`` in EuRoC's files that Kalibr calls otherwise."""
+
+
+def euroc(document: dict[Any, Any]) -> Camera:
+    """The camera of a ``sensor.yaml`` of EuRoC, TUM-VI or alike; raises ``CalibrationError`` for an unknown model and
+    unusable values."""
+    lens = value_of(document, "distortion_model")
+    table = {**document, "distortion_model": _EUROC_LENSES.get(lens, lens) if isinstance(lens, str) else lens}
+    return camera_of("sensor.yaml", table | {"distortion_coeffs": document.get("distortion_coefficients")})
+
+
 def _kalibr_fisheye(table: dict[Any, Any], width: Any, height: Any) -> Camera:
     fx, fy, cx, cy = _intrinsics(table, "fu, fv, pu, pv")
     k1, k2, k3, k4 = list_of(table, "distortion_coeffs", "k1, k2, k3, k4")
@@ -343,16 +355,18 @@ _MAX_SKEW = 1e-6
 
 def opencv(document: dict[Any, Any]) -> Camera:
     """A pinhole, a fisheye (``fisheye_model: 1``, or ROS's ``distortion_model: equidistant``) or MEI (``xi``).
+    Its matrices are called as OpenCV's samples call them, or K and D.
 
     Raises ``CalibrationError`` for another file, and if its four coefficients may be those of a fisheye or a pinhole.
     """
     size = value_of(document, "image_width"), value_of(document, "image_height")
-    with located("camera_matrix"):
-        fx, skew, cx, zero, fy, cy, *last = _matrix(value_of(document, "camera_matrix"), 9)
+    matrix, coefficients = ("K", "D") if "D" in document else ("camera_matrix", "distortion_coefficients")
+    with located(matrix):
+        fx, skew, cx, zero, fy, cy, *last = _matrix(value_of(document, matrix), 9)
         if abs(skew) > _MAX_SKEW * abs(fx) or (zero, *last) != (0.0, 0.0, 0.0, 1.0):
             raise CalibrationError("is not a matrix [fx 0 cx; 0 fy cy; 0 0 1]: give one without skew.")
-    with located("distortion_coefficients"):
-        lens = _matrix(document["distortion_coefficients"], None)
+    with located(coefficients):
+        lens = _matrix(document[coefficients], None)
     middle = cx + PIXEL_CENTRE_SHIFT, cy + PIXEL_CENTRE_SHIFT
     if "xi" in document:
         k1, k2, p1, p2 = _four(lens, "k1, k2, p1, p2")

@@ -192,8 +192,9 @@ def _of_camera(path: Path, camera: Camera) -> bool:
 
 def _belonging(cameras: Mapping[str, Camera], folder: str, folders: Sequence[str]) -> Mapping[str, Camera]:
     """The camera that has the name of a folder, or its number if every folder has that of one; else all."""
-    if folder in cameras:
-        return {folder: cameras[folder]}
+    called = next((name for name in cameras if name.lower() == folder.lower()), None)
+    if called is not None:
+        return {called: cameras[called]}
     of_number = {int(name): name for name in cameras if name.isdigit()}
     numbers = {name: int(found[0]) for name in folders if len(found := re.findall(r"[0-9]+", name)) == 1}
     if len(set(numbers.values()) & of_number.keys()) == len(folders):

@@ -52,6 +52,42 @@ def test_mei_has_its_mirror(tmp_path):
     assert isinstance(camera, Mei) and camera.xi == 1.25 and camera.distortion == tuple(RADIAL)
 
 
+def test_matrices_may_be_called_k_and_d(tmp_path):
+    """As programs write them that calibrate fisheyes and omnidirectional cameras."""
+    path = written(tmp_path, RADIAL, xi=np.array([[1.25]]))
+    wanted = load_camera(path)
+    path.write_text(path.read_text().replace("camera_matrix", "K").replace("distortion_coefficients", "D"))
+    assert load_camera(path) == wanted
+    path.write_text(path.read_text().replace("image_width", "columns"))
+    with pytest.raises(CalibrationError, match="key 'image_width' is missing"):
+        load_camera(path)
+
+
+EUROC = """%YAML:1.0
+sensor_type: camera
+comment: VI-Sensor cam0 (MT9M034)
+T_BS: {rows: 4, cols: 4, data: [0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}
+rate_hz: 20
+resolution: [640, 480]
+camera_model: pinhole
+intrinsics: [401.5, 402.5, 318.25, 239.75]
+distortion_model: MODEL
+distortion_coefficients: [0.02, -0.01, 0.003, -0.0005]
+"""
+
+
+def test_the_camera_of_a_euroc_folder(tmp_path):
+    path = tmp_path / "sensor.yaml"
+    path.write_text(EUROC.replace("MODEL", "equidistant"))
+    assert load_camera(path) == KannalaBrandt(640, 480, 401.5, 402.5, 318.75, 240.25, tuple(FISHEYE))
+    path.write_text(EUROC.replace("MODEL", "radial-tangential"))
+    assert load_camera(path) == Mei(640, 480, 401.5, 402.5, 318.75, 240.25, 0.0, tuple(FISHEYE))
+    for wrong, said in (("fov", "the distortion_model 'fov' is not supported"), ("[1]", "is not supported")):
+        path.write_text(EUROC.replace("MODEL", wrong))
+        with pytest.raises(CalibrationError, match=said):
+            load_camera(path)
+
+
 ROS = """image_width: 640
 image_height: 480
 camera_name: front

@@ -89,7 +89,8 @@ def _lines(row: RunRow, now: datetime, hidden: bool) -> str:
     changed = f" · {escape(row.changes)}" if row.changes else ""
     how = f'<div style="{CUT}">{verdict_html(row)}<span style="{DIM}"> · {method}{changed}</span></div>'
     facts = [f"{row.inliers}/{row.correspondences}"]
-    facts += [] if row.outlier_rate is None else [f"{100.0 * row.outlier_rate:.0f} % out"]
+    estimated = "est. " if row.rotation_error_deg is None else ""  # by the front end, before the run
+    facts += [] if row.outlier_rate is None else [f"{estimated}{100.0 * row.outlier_rate:.0f} % out"]
     errors = (words.angle(row.rotation_error_deg), words.distance(row.translation_error_m, row.metric))
     facts += [fact for fact in errors if fact != words.UNKNOWN]
     facts.append(words.duration(row.time_ms))
