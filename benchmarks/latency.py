@@ -48,7 +48,7 @@ CASES = (
     Case("step, N 200, mc", 200, 80.0, "mc (the paper's)", 5.0, step=True),
     Case("step, N 200, mc, for the first time", 200, 80.0, "mc (the paper's)", 5.0, step=True, first=True),
 )
-OPENINGS = ("The yaw most arcs share", "What no pose can beat, at each yaw")
+OPENINGS = ("The yaw most arcs share", "What no pose can beat, at each yaw", "What no pose can beat")
 """Titles of the steps at which pages open."""
 READY_S, STARTS = 1.5, 5
 CROWD = 5

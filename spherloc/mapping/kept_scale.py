@@ -25,7 +25,7 @@ def kept_scale(folder: Path) -> ScaleMeasurement:
     try:
         table = json.loads(read_file(path, MAX_BYTES).decode())
         return _read(table)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return ScaleMeasurement()
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read ({reason(error)}); remove it, and give the scale again.") from None

@@ -37,7 +37,10 @@ class Runs {
   }
 
   // Whether a length must say that it is not in metres, since others in its column are.
-  saysUnit(name, i) { return LENGTHS.includes(name) && this.unit.includes(" ") && this.value("units", i) === "units"; }
+  saysUnit(name, i) {
+    const isLength = LENGTHS.includes(name) && Number.isFinite(this.value(name, i));
+    return isLength && this.unit.includes(" ") && this.value("units", i) === "units";
+  }
   isNumber(name) { return name in this.numbers; }
   has(name) { return name in this.numbers || name in this.texts || name === "labels" || name === "file"; }
 
