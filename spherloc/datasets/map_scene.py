@@ -215,6 +215,22 @@ def _contradiction(stated: Gravity, nearby: Gravity | None) -> tuple[str, ...]:
 
 REQUIRED = {"kind", "name"}
 OPTIONAL = {"about", "frontend", "gravity", "masks", "options", "thresholds", "units"}
+OPTIONAL_EXAMPLE = """\
+about = "a line about it"
+units = "unknown"                      # the map has no scale; else lengths are metres
+thresholds = [[1, 0.1], [5, 0.5]]      # limits of success, degrees and metres
+
+[options]
+bound_px = 4.0                         # of an inlier, for all estimators
+
+[frontend]                             # docs/datasets.md has all of its keys
+features = "sift"
+references = 4                         # how many of the most similar references are matched
+
+[masks]                                # pixels that are left out
+nadir_deg = 25                         # degrees around the camera's own down
+"""
+"""The keys that scenes of images of every kind may have, but for ``[gravity]``."""
 UNITS: Mapping[str, bool] = {"metres": True, "unknown": False}
 """Values of ``units``, and whether lengths are metres then."""
 

@@ -5,6 +5,10 @@ from pathlib import Path
 from spherloc.datasets import bundled_scenes
 from spherloc.datasets.scene_file import SceneKind, read_table, scene_kind, scene_kinds
 from spherloc.errors import InputError
+from spherloc.registry import extension_of
+
+PROBLEMS = ("correspondences", "synthetic")
+"""Kinds of scenes that are one problem, not made of images."""
 
 
 def list_lessons(export: Path | None, handout: Path | None) -> int:
@@ -72,6 +76,10 @@ def one_kind(name: str) -> str:
     parts = [_plain(kind.documentation)]
     if kind.example:
         parts.append(f"For example:\n\n{kind.example.strip()}")
+    if name not in PROBLEMS and not extension_of("datasets", name):
+        from spherloc.datasets.map_scene import OPTIONAL_EXAMPLE  # takes half a second
+
+        parts.append(f"Every scene of images may also have:\n\n{OPTIONAL_EXAMPLE.strip()}")
     if bundled := [str(path) for path in bundled_scenes().values() if _kind(path) == name]:
         parts.append("\n".join(["Bundled:", *bundled]))
     return "\n\n".join([*parts, *([f"Needs: {_install(kind)}"] if kind.extras else [])])

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from sequence_samples import true_pose, write_scene
 from spherloc import registry
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.datasets import load_scene
-from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.map_scene import OPTIONAL, OPTIONAL_EXAMPLE, MapScene
 from spherloc.errors import SpherlocError
 from spherloc.experiments import read_results
 from spherloc.experiments.sequence import inputs_of
@@ -395,7 +396,9 @@ def test_one_query_of_a_scene_can_be_run_alone(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("drawn")
 def test_scenes_names_kinds_that_others_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "drawn_matches", raising=False)
-    assert "A map scene whose matches are drawn" in one_kind("drawn")
+    assert "A map scene whose matches are drawn" in one_kind("drawn") and "may also have" not in one_kind("drawn")
+    assert tomllib.loads(OPTIONAL_EXAMPLE).keys() == OPTIONAL - {"gravity"}
+    assert OPTIONAL_EXAMPLE.strip() in one_kind("colmap") and "may also have" not in one_kind("synthetic")
     with pytest.raises(SpherlocError, match=r"choose one of .*drawn"):
         one_kind("magic")
     registry.lookup.cache_clear()
