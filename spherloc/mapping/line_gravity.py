@@ -1,7 +1,8 @@
 """Gravity of a map's photographs by their vertical lines, also where a headset or a car stores them sideways.
 
 One image cannot tell whether it is upright: in rooms, horizontal edges meet as well as vertical ones. Several can: held
-by one camera, vertical edges meet about where they did in the image before, and horizontal ones wherever it turned.
+by one camera, vertical edges meet about where they did in the image before, and horizontal ones wherever it turned. In
+the map, vertical edges of all images meet in one direction, and horizontal ones in two.
 """
 
 from collections import defaultdict
@@ -23,13 +24,16 @@ from spherloc.types import FloatArray
 RIGHT = np.array([1.0, 0.0, 0.0])
 MIN_IMAGES = 5
 """Least number of images that tell whether they are stored sideways."""
-STEADY_DEG = 12.0
-"""Gravity of an image is steady if it is this near to the middle of those of its camera."""
-MIN_SIDEWAYS, MAX_UPRIGHT = 0.7, 0.5
-"""Images are stored sideways if at least the first share of all is steady for it, and at most the second if they were
-upright. Of upright images of an apartment, a street and a courtyard 100 % are upright and 0 to 60 % sideways."""
+STEADY_DEG = 16.0
+"""Gravity of an image is steady if it is this near to the middle of those of its camera: heads tilt."""
+CLEAR = 0.25
+"""If the shares of images that are steady upright and sideways differ by less, only the map tells which they are."""
+AGREE_DEG = 3.0
+"""Gravity of two images agrees in the map if it differs by less from the middle of all."""
+CLEARLY_MORE = 1.25
+"""Images are stored sideways if this many times more of them agree so than upright."""
 LEANING_DEG = 20.0
-"""If images lean more than that in the median and would be as steady sideways, they may be stored sideways."""
+"""If images lean more than that in the median and would agree as well sideways, they may be stored sideways."""
 
 
 @dataclass(frozen=True)
@@ -41,14 +45,40 @@ class GravityByLines:
     """Why lines gave no gravity, in a part of a sentence such as "it has 3 straight edges, fewer than 5."."""
     sideways: bool = False
     """Whether the images are stored sideways: down is at their right or left."""
-    unsure_deg: float = 0.0
-    """If they may be stored sideways: by how much they lean if they are not; else 0."""
+    unsure: bool = False
+    """Whether the images alone do not tell that."""
+    other: "GravityByLines | None" = None
+    """What lines tell if it is the other way round; None if that is impossible."""
 
-    def turned_down(self, poses: Mapping[str, FloatArray], points: FloatArray) -> "GravityByLines":
-        """The same, or the opposite if most points (N, 3) of a map, in which images have ``poses`` (3, 4), would be
-        above the camera next to them: rooms and streets have more to see below."""
-        downs = [poses[name][:, :3].T @ one.down for name, one in self.found.items() if name in poses]
-        if not downs or share_below(poses, points, np.sum(downs, axis=0)) >= 0.5:
+    def in_map(self, poses: Mapping[str, FloatArray], points: FloatArray) -> "GravityByLines":
+        """This or the other way round, whichever agrees better in a map of images with ``poses`` (3, 4).
+
+        Where images are stored sideways, down is their right or left, whichever has more points (N, 3) below the camera
+        next to them: rooms and streets have more to see below. Images that lean are ``unsure`` if both ways agree.
+        """
+        if self.other is None:
+            return replace(self, unsure=False)
+        upright, sideways = sorted((replace(self, unsure=False, other=None), self.other), key=lambda one: one.sideways)
+        here, there = upright._agreeing(poses), sideways._agreeing(poses)
+        if there >= MIN_IMAGES and there > CLEARLY_MORE * here:
+            return sideways._turned_down(poses, points)
+        leans = [np.degrees(np.arccos(np.clip(one.down @ DOWN, -1.0, 1.0))) for one in upright.found.values()]
+        unsure = there > here / CLEARLY_MORE and bool(leans) and float(np.median(leans)) > LEANING_DEG
+        return replace(upright, unsure=unsure)
+
+    def _agreeing(self, poses: Mapping[str, FloatArray]) -> int:
+        """Number of images whose gravity is about the middle of all, in the map."""
+        downs = self._downs(poses)
+        if not downs:
+            return 0
+        near = np.stack(downs) @ middle(np.stack(downs)) > np.cos(np.radians(AGREE_DEG))
+        return int(np.count_nonzero(near))
+
+    def _downs(self, poses: Mapping[str, FloatArray]) -> list[FloatArray]:
+        return [poses[name][:, :3].T @ one.down for name, one in self.found.items() if name in poses]
+
+    def _turned_down(self, poses: Mapping[str, FloatArray], points: FloatArray) -> "GravityByLines":
+        if share_below(poses, points, middle(np.stack(self._downs(poses)))) >= 0.5:
             return self
         return replace(self, found={name: replace(one, down=-one.down) for name, one in self.found.items()})
 
@@ -62,8 +92,8 @@ def share_below(poses: Mapping[str, FloatArray], points: FloatArray, down: Float
 def gravity_by_lines(views: Sequence[View], tell: Tell, stated: Mapping[str, Gravity] | None = None) -> GravityByLines:
     """Gravity of those images whose vertical lines show it, and the reasons of the others.
 
-    It is searched below, but where images of the same camera have ``stated`` gravity, around that. Images that are no
-    panoramas may be stored sideways. ``tell`` is called after each image.
+    It is searched below, but where images of the same camera have ``stated`` gravity, around that. If none has, and
+    none is a panorama, images may be stored sideways. ``tell`` is called after each image.
     """
     todo = [view for view in views if view.name not in (stated or {})]
     near = _stated_directions(views, stated or {})
@@ -89,17 +119,21 @@ def gravity_by_lines(views: Sequence[View], tell: Tell, stated: Mapping[str, Gra
         tell("images searched for vertical lines", done, len(todo))
     upright, sideways = ({view.name: ways[view.name][way] for view in todo} for way in (0, 1))
     free = [v for v in todo if repr(v.camera) not in near and not isinstance(v.camera, Equirectangular)]
-    shares = _steady_share(free, upright), _steady_share(free, sideways)
-    turned = len(free) >= MIN_IMAGES and shares[0] <= MAX_UPRIGHT and shares[1] >= MIN_SIDEWAYS
-    names = {view.name for view in free} if turned else set()
-    chosen = {name: sideways[name] if name in names else one for name, one in upright.items()}
-    leaning = [np.degrees(np.arccos(min(1.0, one.down @ DOWN))) for one in _of(free, upright).values()]
-    doubt = float(np.median(leaning)) if leaning and not turned and shares[1] >= MIN_SIDEWAYS else 0.0
+    if not free or len(free) < len(todo):
+        return _told(upright, sideways=False)
+    more = _steady_share(free, sideways) - _steady_share(free, upright)
+    one, other = _told(upright, sideways=False), _told(sideways, sideways=True)
+    if len(free) < MIN_IMAGES or more <= -CLEAR:
+        return replace(one, other=other)
+    return replace(other, other=one) if more >= CLEAR else replace(one, unsure=True, other=other)
+
+
+def _told(found: Mapping[str, Gravity | str], *, sideways: bool) -> GravityByLines:
+    """Gravity and reasons, by the name of the image."""
     return GravityByLines(
-        {name: one for name, one in chosen.items() if isinstance(one, Gravity)},
-        {name: one for name, one in chosen.items() if isinstance(one, str)},
-        turned,
-        doubt if doubt > LEANING_DEG else 0.0,
+        {name: one for name, one in found.items() if isinstance(one, Gravity)},
+        {name: one for name, one in found.items() if isinstance(one, str)},
+        sideways,
     )
 
 

@@ -147,11 +147,10 @@ def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
     kept = Kept(masks, request.how, stated)
     known = {} if stated is None else stated.found
     lines = gravity_by_lines(views, tell, known)
+    believed = {**known, **({} if lines.unsure else lines.found)}
+    first, *others = reconstruct(views, [believed.get(view.name) for view in views], folder, tell, request.how)
+    lines = lines.in_map(first.poses, first.points())
     gravity = {**known, **lines.found}
-    first, *others = reconstruct(views, [gravity.get(view.name) for view in views], folder, tell, request.how)
-    if lines.sideways:
-        lines = lines.turned_down(first.poses, first.points())
-        gravity = {**known, **lines.found}
     found = _finished(first, views, nearer_to_others(first, others), gravity, measured, tell)
     inside = set(found[0].poses)
     written = write_map(*found, views, request.images, folder, request.new_images, kept)

@@ -16,7 +16,7 @@ from spherloc.frontend import trained
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
 from spherloc.mapping.advice import advice
-from spherloc.mapping.line_gravity import share_below
+from spherloc.mapping.line_gravity import LEANING_DEG, share_below
 from spherloc.mapping.make import Map
 from spherloc.mapping.pairs import MIN_MATCHES
 from spherloc.mapping.photographs import Photographs, cameras_of
@@ -47,10 +47,10 @@ def summary(made: Map, found: Photographs) -> list[str]:
         f"features      {about_features(made)}",
         f"scale         {made.scale.source or _units_unknown(made)}",
     ]
-    if made.lines.unsure_deg:
+    if made.lines.unsure:
         lines.append(
-            f"in doubt      whether down is right: by their lines the images lean by {made.lines.unsure_deg:.0f}° "
-            f"(median), or are stored sideways; {advice('sideways')}"
+            "in doubt      whether down is right: by their lines, most images lean by more than "
+            f"{LEANING_DEG:.0f}° or are stored sideways; {advice('sideways')}"
         )
     if made.stated and (above := 1.0 - share_below(written.poses, written.points, -UP)) > MOST_ABOVE:
         lines.append(

@@ -55,41 +55,57 @@ def quiet(*_) -> None:
     """Nobody is told."""
 
 
+def map_of(views: list[View]) -> tuple[dict, np.ndarray]:
+    """Poses, and points of which two thirds are below the cameras."""
+    poses = {view.name: view.cam_from_map for view in views}
+    centres = np.stack([camera_centre(pose) for pose in poses.values()])
+    offsets = np.tile([[2.0, 0.0, -1.0], [0.0, 3.0, -0.5], [1.0, 1.0, 0.8]], (len(views), 1))
+    return poses, np.repeat(centres, 3, axis=0) + offsets
+
+
 @pytest.mark.parametrize("quarters", [1, 3])
 def test_images_that_are_stored_sideways_tell_down_all_the_same(upright, tmp_path, quarters):
     """Down is at their right or at their left, which the points of the map tell: most are below the cameras."""
     views = turned(upright, tmp_path, quarters)
     lines = gravity_by_lines(views, quiet)
-    assert lines.sideways and len(lines.found) >= 5
-    poses = {view.name: view.cam_from_map for view in views}
-    centres = np.stack([camera_centre(pose) for pose in poses.values()])
-    points = np.repeat(centres, 3, axis=0) + np.tile([[2.0, 0.0, -1.0], [0.0, 3.0, -0.5], [1.0, 1.0, 0.8]], (COUNT, 1))
+    assert lines.sideways and not lines.unsure and len(lines.found) >= 5
+    poses, points = map_of(views)
     assert share_below(poses, points, np.array([0.0, 0.0, -1.0])) == pytest.approx(2 / 3)
-    found = lines.turned_down(poses, points).found
-    assert max(off_deg(view, found[view.name]) for view in views if view.name in found) < 1.0
-    assert (found is lines.found) == (quarters == 1)
+    for doubted in (lines, replace(lines, unsure=True), replace(lines.other, other=replace(lines, other=None))):
+        found = doubted.in_map(poses, points)
+        assert found.sideways and not found.unsure
+        assert max(off_deg(view, found.found[view.name]) for view in views if view.name in found.found) < 1.0
 
 
 def test_upright_images_are_not_taken_for_such(upright):
     lines = gravity_by_lines(upright, quiet)
-    assert not lines.sideways and not lines.unsure_deg
-    assert max(off_deg(view, lines.found[view.name]) for view in upright) < 1.0
+    assert not lines.sideways and not lines.unsure
+    poses, points = map_of(upright)
+    for doubted in (lines, replace(lines, unsure=True), replace(lines.other, other=replace(lines, other=None))):
+        found = doubted.in_map(poses, points)
+        assert not found.sideways and not found.unsure
+        assert max(off_deg(view, found.found[view.name]) for view in upright) < 1.0
 
 
-def test_a_few_images_that_may_be_sideways_are_told_and_taken_as_upright(upright, tmp_path):
-    """One image of each of several cameras: nothing has turned, and each way is as steady as the other."""
+def test_a_camera_that_has_not_turned_does_not_tell(upright, tmp_path):
+    """Each image is alone with its camera, so that only the map tells; without one they are taken as upright."""
     views = [
         replace(view, camera=replace(view.camera, fx=view.camera.fx + 1e-6 * k))
         for k, view in enumerate(turned(upright, tmp_path, 1))
     ]
     lines = gravity_by_lines(views, quiet)
-    leans = [off_deg(view, lines.found[view.name]) for view in views if view.name in lines.found]
-    assert not lines.sideways and np.median(leans) > 45.0
+    assert lines.unsure and not lines.sideways
+    assert lines.in_map(*map_of(views)).sideways
+    same = [replace(view, cam_from_map=views[0].cam_from_map) for view in views]  # they all see the same
+    both = replace(lines, found={view.name: lines.other.found[views[0].name] for view in views})
+    other = replace(lines.other, found={view.name: lines.other.found[views[0].name] for view in views})
+    found = replace(both, other=other).in_map(*map_of(same))
+    assert found.unsure and not found.sideways
 
 
 def test_gravity_that_a_file_states_shows_where_to_look_in_the_others(upright, tmp_path):
     views = turned(upright, tmp_path, 3)
     stated = {views[0].name: Gravity(views[0].cam_from_map[:, :3] @ [0.0, 0.0, -1.0], "the gravity file", 0.02)}
     lines = gravity_by_lines(views, quiet, stated)
-    assert views[0].name not in lines.found and not lines.sideways and len(lines.found) >= 4
+    assert views[0].name not in lines.found and lines.other is None and len(lines.found) >= 4
     assert max(off_deg(view, lines.found[view.name]) for view in views[1:] if view.name in lines.found) < 1.0
