@@ -334,12 +334,14 @@ def folder_for(base: Path, configuration: Configuration) -> Path:
 
     Raises ``InputError`` if a configuration there is damaged.
     """
-    for number in itertools.count(1):
-        folder = base if number == 1 else base.with_name(f"{base.name}_{number}")
-        path = folder / CONFIGURATION
-        if not os.path.lexists(path) or not read_configuration(path).differences(configuration):
-            return folder
-    raise AssertionError
+    others = (base.with_name(f"{base.name}_{number}") for number in itertools.count(2))
+    return next(folder for folder in itertools.chain([base], others) if _may_hold(folder, configuration))
+
+
+def _may_hold(folder: Path, configuration: Configuration) -> bool:
+    """Whether a folder has results of that configuration, or of none."""
+    path = folder / CONFIGURATION
+    return not os.path.lexists(path) or not read_configuration(path).differences(configuration)
 
 
 class ResultsLog:

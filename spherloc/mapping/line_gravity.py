@@ -50,6 +50,12 @@ class GravityByLines:
     other: "GravityByLines | None" = None
     """What lines tell if it is the other way round; None if that is impossible."""
 
+    @property
+    def leans(self) -> bool:
+        """Whether most images would lean much, more than people hold cameras."""
+        angles = [np.degrees(np.arccos(np.clip(one.down @ DOWN, -1.0, 1.0))) for one in self.found.values()]
+        return bool(angles) and float(np.median(angles)) > LEANING_DEG
+
     def in_map(self, poses: Mapping[str, FloatArray], points: FloatArray) -> "GravityByLines":
         """This or the other way round, whichever agrees better in a map of images with ``poses`` (3, 4).
 
@@ -62,9 +68,7 @@ class GravityByLines:
         here, there = upright._agreeing(poses), sideways._agreeing(poses)
         if there >= MIN_IMAGES and there > CLEARLY_MORE * here:
             return sideways._turned_down(poses, points)
-        leans = [np.degrees(np.arccos(np.clip(one.down @ DOWN, -1.0, 1.0))) for one in upright.found.values()]
-        unsure = there > here / CLEARLY_MORE and bool(leans) and float(np.median(leans)) > LEANING_DEG
-        return replace(upright, unsure=unsure)
+        return replace(upright, unsure=there > here / CLEARLY_MORE and upright.leans)
 
     def _agreeing(self, poses: Mapping[str, FloatArray]) -> int:
         """Number of images whose gravity is about the middle of all, in the map."""
@@ -123,7 +127,9 @@ def gravity_by_lines(views: Sequence[View], tell: Tell, stated: Mapping[str, Gra
         return _told(upright, sideways=False)
     more = _steady_share(free, sideways) - _steady_share(free, upright)
     one, other = _told(upright, sideways=False), _told(sideways, sideways=True)
-    if len(free) < MIN_IMAGES or more <= -CLEAR:
+    if len(free) < MIN_IMAGES:
+        return replace(one, unsure=one.leans, other=other)
+    if more <= -CLEAR:
         return replace(one, other=other)
     return replace(other, other=one) if more >= CLEAR else replace(one, unsure=True, other=other)
 
@@ -171,4 +177,4 @@ def middle(directions: FloatArray) -> FloatArray:
     for _ in range(50):
         weights = 1.0 / np.maximum(np.linalg.norm(directions - found, axis=1), 1e-9)
         found = weights @ directions / weights.sum()
-    return found / np.linalg.norm(found)
+    return found / max(float(np.linalg.norm(found)), 1e-12)

@@ -31,9 +31,9 @@ MOMENTS: tuple[Moment, ...] = (
     (
         ("outcome",),
         "The pose, and your turn",
-        "Green matches agree with the pose; View Sphere shows the others too, in red: click a dot to ask why it was "
-        "rejected. Walk through the steps with Next and Previous. Drag a slider of the settings: it is solved anew "
-        "while you drag. Presets are simulations in which you choose how many matches are wrong.",
+        "Green matches agree with the pose, red ones do not, and View Sphere shows all of them: click a dot to ask why "
+        "it was rejected. Walk through the steps with Next and Previous. Drag a slider of the settings: it is solved "
+        "anew while you drag. Presets are simulations in which you choose how many matches are wrong.",
     ),
 )
 BY_SAMPLES = {

@@ -470,7 +470,7 @@ def _clique(view: RunView, arcs: StageArcs) -> Frame:
             *items,
             ring.spoke("ring/estimate", view, view.middle, stage.yaw_rad, style.ESTIMATE),
             ring.name("ring/name", view, stage.yaw_rad, "maximum clique of arcs"),
-            ring.name("ring/ring", view, stage.yaw_rad + np.pi, "yaw ring", stage.overlap),
+            ring.name("ring/ring", view, stage.yaw_rad + np.pi, "yaw ring, as high as arcs overlap", stage.overlap),
         ),
     )
 
