@@ -225,6 +225,8 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     said = (*remarks, *assumed, *skipped, *unknown, *missing, *unpaired)
     matcher = _matcher(table, path, model, tuple(references), pairs)
     others = {"matcher": matcher, "assumed_down": bool(assumed), "cloud": model.points.xyz}
+    named = [key for key in ("features", "matches", "pairs", "global_features") if key in table]
+    others["matched_files"] = tuple(_file(table, key, path) for key in named)
     return settings.scene(path, queries, references, down, said, **others)
 
 

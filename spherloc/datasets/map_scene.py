@@ -78,6 +78,8 @@ class MapScene:
     """What the true poses come from, if it knew more than a query's image is to tell; empty for a measurement."""
     remarks: tuple[str, ...] = ()
     """What the loader skipped and why, in sentences."""
+    matched_files: tuple[Path, ...] = ()
+    """Files of another program that matches are read from."""
 
     def __post_init__(self) -> None:
         for what, views in (("query", self.queries), ("reference", self.references)):

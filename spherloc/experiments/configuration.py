@@ -15,7 +15,7 @@ from spherloc.datasets.map_scene import MapScene, Thresholds
 from spherloc.datasets.scene_file import numbers
 from spherloc.errors import InputError, show
 from spherloc.estimators.base import versions
-from spherloc.files import read_file, reading
+from spherloc.files import read_file, reading, size_of
 from spherloc.types import FloatArray
 
 MAX_TOLD = 3
@@ -66,7 +66,8 @@ class Configuration:
     scene: str
     """Path of the scene file."""
     scene_sha256: str
-    """Hash of its content and of the poses of its references, which change with the map."""
+    """Hash of its content, of the poses of its references, which change with the map, and of what matches are read
+    from."""
     name: str
     """The scene's name."""
     estimator: str
@@ -118,13 +119,13 @@ def configuration_of(
 
     If there is an ``initialiser``, its name and options are stored as one text among the options.
 
-    Raises ``InputError`` if the file can no longer be read.
+    Raises ``InputError`` if the file, or one that matches are read from, can no longer be read.
     """
     with reading(path, "keep the scene file where it is"):
         content = read_file(path, MAX_BYTES)
     return Configuration(
         scene=str(path),
-        scene_sha256=hashlib.sha256(content + _poses_of(scene)).hexdigest(),
+        scene_sha256=hashlib.sha256(content + _poses_of(scene) + _sizes_of(scene)).hexdigest(),
         name=scene.name,
         estimator=estimator,
         options=asdict(options) | ({} if initialiser is None else {"initialise": initialiser}),
@@ -142,6 +143,15 @@ def _poses_of(scene: MapScene) -> bytes:
     """The poses of the references, rounded, so that another processor finds the same."""
     posed = [view.cam_from_map for view in scene.references if view.cam_from_map is not None]
     return (np.round(np.array(posed, dtype=np.float64), DIGITS) + 0.0).tobytes()
+
+
+def _sizes_of(scene: MapScene) -> bytes:
+    """The sizes of the files that matches are read from."""
+    sizes = []
+    for file in scene.matched_files:
+        with reading(file, "keep it where it is"):
+            sizes.append(str(size_of(file)))
+    return " ".join(sizes).encode()
 
 
 def read_configuration(path: Path) -> Configuration:

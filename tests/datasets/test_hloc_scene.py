@@ -9,7 +9,8 @@ from hloc_samples import QUERY, REFERENCES, SCENE, make_world, matches_of, write
 
 from spherloc.datasets import hloc, load_scene
 from spherloc.errors import InputError
-from spherloc.estimators import estimate
+from spherloc.estimators import default_options, estimate
+from spherloc.experiments.configuration import configuration_of
 from spherloc.metrics import evaluate
 from tests.needs import real_data
 
@@ -34,6 +35,20 @@ def test_localizes_from_the_files(world, rng, old, turned):
     scores = evaluate(estimate(problem, "mc", seed=0))
     assert scores.rotation_error_deg < 0.1 and scores.translation_error_m < 0.02
     assert scores.precision > 0.98 and scores.recall > 0.98
+
+
+def test_results_of_other_matches_are_of_another_configuration(world, rng):
+    path = write_all(world, rng).scene
+
+    def now():
+        scene = load_scene(path)
+        return configuration_of(scene, path, "mc", default_options("mc", scene.problem()), 0)
+
+    before = now()
+    assert not before.differences(now())
+    with h5py.File(world.outputs / "matches.h5", "a") as file:
+        file["another/pair/matches0"] = np.arange(4000, dtype=np.int16)
+    assert before.differences(now()) == ["the scene file or its map is another one"]
 
 
 def test_correspondences_are_those_of_the_files(world, rng):
