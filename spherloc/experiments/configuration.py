@@ -121,11 +121,9 @@ def configuration_of(
 
     Raises ``InputError`` if the file, or one that matches are read from, can no longer be read.
     """
-    with reading(path, "keep the scene file where it is"):
-        content = read_file(path, MAX_BYTES)
     return Configuration(
         scene=str(path),
-        scene_sha256=hashlib.sha256(content + _poses_of(scene) + _sizes_of(scene)).hexdigest(),
+        scene_sha256=scene_sha256(scene, path),
         name=scene.name,
         estimator=estimator,
         options=asdict(options) | ({} if initialiser is None else {"initialise": initialiser}),
@@ -137,6 +135,16 @@ def configuration_of(
         registration_thresholds_m=None if scene.registration is None else tuple(scene.registration.thresholds_m),
         metric=scene.metric,
     )
+
+
+def scene_sha256(scene: MapScene, path: Path) -> str:
+    """The hash of the scene of the file ``path`` that a configuration has.
+
+    Raises ``InputError`` if the file, or one that matches are read from, can no longer be read.
+    """
+    with reading(path, "keep the scene file where it is"):
+        content = read_file(path, MAX_BYTES)
+    return hashlib.sha256(content + _poses_of(scene) + _sizes_of(scene)).hexdigest()
 
 
 def _poses_of(scene: MapScene) -> bytes:

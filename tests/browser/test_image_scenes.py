@@ -12,6 +12,7 @@ from playwright.sync_api import Browser, expect
 
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.map_scene import MapScene
+from spherloc_viz.commands.localize import Solving, localize_sequence
 from spherloc_viz.recording.content.data import read_recording
 
 PANORAMA = """
@@ -50,10 +51,13 @@ stop = 0.25
 
 @pytest.fixture(scope="module")
 def images_address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
-    """Address of a playground with a small rendered scene, and where it records."""
+    """Address of a playground with a small rendered scene, and where it records. A query of a scene beside it was
+    localized before."""
     folder = tmp_path_factory.mktemp("images")
     (folder / "small.toml").write_text(SCENE)
     (folder / "fisheye.toml").write_text(SCENE.replace(PANORAMA, FISHEYE).replace("small", "fisheye"))
+    before = Solving("ransac-2p", (), folder / "recordings" / "kept", None)
+    assert localize_sequence(folder / "fisheye.toml", [before], 0, ["query_001"], retry_failed=False) == 0
     with served(folder / "small.toml", "--recordings", folder / "recordings") as (found, _):
         yield found, folder / "recordings"
 
@@ -215,9 +219,14 @@ def test_the_query_on_the_sphere_and_the_mesh_around_it(
     tab.touch("open-folder:0:0:").click()
     tab.page.get_by_text("fisheye apartment").click()
     expect(tab.value("inliers")).to_be_visible()
-    tab.until(lambda: visible("/sphere/image") and tab.node("/sphere/image") != panorama, "another image")
     tab.tab("Images")
     tab.until(lambda: photo(tab, "query")[0] == photo(tab, "query")[1], "a square photograph")
+    tab.tab("Play")
+    expect(tab.page.get_by_text("Localized before by ransac-2p: kept.")).to_be_visible()
+    expect(tab.value("queries")).to_have_text("1 of 3")
+    tab.until(lambda: tab.instances("/trajectory/queries") == 1, "it has its dot")
+    tab.press("Sphere")  # at the outcome, the view shows where the localized photograph was taken
+    tab.until(lambda: visible("/sphere/image") and tab.node("/sphere/image") != panorama, "another image")
     tab.expect_quiet(images_address[0])
 
 

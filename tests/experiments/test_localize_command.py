@@ -3,6 +3,7 @@
 import csv
 import importlib
 import json
+import os
 import re
 import resource
 import signal
@@ -25,6 +26,7 @@ from spherloc.datasets import load_scene
 from spherloc.datasets.map_scene import OPTIONAL, OPTIONAL_EXAMPLE, MapScene
 from spherloc.errors import SpherlocError
 from spherloc.experiments import read_results
+from spherloc.experiments.kept_results import kept_results
 from spherloc.experiments.sequence import inputs_of
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.scene_files import MODEL, SCENE
@@ -231,6 +233,27 @@ def test_a_query_that_has_changed_is_done_again(tmp_path: Path, capsys: pytest.C
     assert "2 of 3 queries are done already" in told and [row.inputs for row in read_results(out).rows] == now
     told = again(None, "0" * 16, "1" * 16)
     assert f"true pose of {rows[1]['query']} and 1 more has changed" in told and "1 of 3 queries are done" in told
+
+
+@pytest.mark.usefixtures("drawn")
+def test_what_was_localized_before_is_found(tmp_path: Path) -> None:
+    """The newest results of the scene as it is now, without queries that have changed since."""
+    path, folder = write_scene(tmp_path, queries=3), tmp_path / "results"
+    scene = load_scene(path)
+    assert isinstance(scene, MapScene) and kept_results(folder, scene, path) is None
+    assert run(path, folder / "all") == 0 and run(path, folder / "one", queries=["image1.png"]) == 0
+    (folder / "damaged").mkdir()
+    (folder / "damaged" / "configuration.json").write_text("{")
+    for name, age_s in (("all", 10.0), ("one", 0.0)):
+        os.utime(folder / name / "configuration.json", (1e9 - age_s, 1e9 - age_s))
+    found = kept_results(folder, scene, path)
+    assert found is not None and found.folder == folder / "one" and found.names == ("image1.png",)
+    os.utime(folder / "one" / "configuration.json", (1e9 - 20.0, 1e9 - 20.0))
+    (tmp_path / "images" / "image1.png").write_bytes(b"another image")
+    found = kept_results(folder, scene, path)
+    assert found is not None and found.folder == folder / "all" and found.names == ("image0.png", "image2.png")
+    path.write_text(path.read_text().replace("drawn walk", "another walk"))
+    assert kept_results(folder, scene, path) is None
 
 
 def test_what_a_result_depends_on_is_noticed(tmp_path: Path) -> None:

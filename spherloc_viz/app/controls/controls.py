@@ -208,7 +208,7 @@ class Controls:
         self.review = ReviewCard(owner.redraw)
         tabs = gui.add_tab_group()
         with self._tab(gui, tabs, "Play"):
-            self._build_play(gui, touches)
+            self._build_play(gui, touches, services.library and services.library.folder)
         with self._tab(gui, tabs, "Compare"):
             gui.add_html(heading_html("Several estimators on this problem", "estimator"))
             self.compare = ComparePanel(gui, touches, owner.use_estimator, owner.redraw, owner.prepare_estimator)
@@ -239,7 +239,7 @@ class Controls:
             self.review.stand(gui)
             yield
 
-    def _build_play(self, gui: viser.GuiApi, touches: Touches) -> None:
+    def _build_play(self, gui: viser.GuiApi, touches: Touches, results: Path | None) -> None:
         gui.add_html(heading_html("Drag a slider: each move is solved at once", "estimator"))
         self._preset = gui.add_dropdown(
             "Preset",
@@ -253,7 +253,8 @@ class Controls:
         self._movable.on_update(self._owner.redraw)
         self._edits = gui.add_html("", visible=False)
         self.estimator = EstimatorControls(gui, self._owner.changed)
-        self.sequence = SequencePanel(gui, touches, self._chosen_sequence, self._localized, self.open_query)
+        ask = self._chosen_sequence, self._localized, self.open_query
+        self.sequence = SequencePanel(gui, touches, results, *ask)
         self.display = DisplayControls(gui, self._owner.redraw)
 
     @property
@@ -314,7 +315,7 @@ class Controls:
         return trajectory_items(rows, run.trace.problem.aligned.map_turn, scene.thresholds[-1][1])
 
     def _show_scene(self, label: str) -> None:
-        self.sequence.show(label, self._catalog.map_scene(label))
+        self.sequence.show(label, self._catalog.map_scene(label), self._catalog.path(label))
         self._movable.visible = self._catalog.synthetic(label) is not None
 
     def _follow_preset(self, request: RunRequest, hidden: bool) -> None:

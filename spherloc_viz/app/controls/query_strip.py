@@ -8,6 +8,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
+from pathlib import Path
 
 import cv2
 
@@ -57,7 +58,7 @@ class QueryStrip:
         self._scene: MapScene | None = None
         self._rows: Mapping[str, QueryResult] = {}
         self._order, self._page, self._hidden = "order", 0, False
-        self._pictures: OrderedDict[tuple[int, str], str] = OrderedDict()
+        self._pictures: OrderedDict[Path, str] = OrderedDict()
         self._worker = BackgroundWorker("spherloc-strip", failed)
         touches.on("strip-order", self._sort)
         touches.on("strip-page", self._turn)
@@ -105,20 +106,19 @@ class QueryStrip:
         views = ordered(scene.queries, known, order)
         page = min(page, (len(views) - 1) // PAGE)
         shown = views[page * PAGE : (page + 1) * PAGE]
-        pictures = {view.name: self._picture(scene, view) for view in shown}
+        pictures = {view.name: self._picture(view) for view in shown}
         self._show(strip_html(shown, pictures, known, order, page, len(views), "m" if scene.metric else "units"))
 
-    def _picture(self, scene: MapScene, view: View) -> str:
+    def _picture(self, view: View) -> str:
         """Address of the view's thumbnail; empty if there is none yet."""
-        key = id(scene), view.name
-        if key not in self._pictures:
+        if view.path not in self._pictures:
             address = thumbnail(view)
             if not address:
                 return ""
-            self._pictures[key] = address
+            self._pictures[view.path] = address
             if len(self._pictures) > KEPT:
                 self._pictures.popitem(last=False)
-        return self._pictures[key]
+        return self._pictures[view.path]
 
 
 def thumbnail(view: View) -> str:

@@ -2,13 +2,15 @@
 
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import viser
 
 from spherloc.datasets.map_scene import MapScene
-from spherloc.errors import SpherlocError
+from spherloc.errors import SpherlocError, shorten
+from spherloc.experiments.kept_results import kept_results
 from spherloc.experiments.results import LOCALIZED, QueryResult
 from spherloc.experiments.sequence import localize
 from spherloc.experiments.summary import success_rates
@@ -23,19 +25,21 @@ START, STOP = "Localize all queries", "Stop"
 
 
 class SequencePanel:
-    """A button, a bar and a table; ``rows`` are what is done by now of the sequence that was started last."""
+    """A button, a bar and a table; ``rows`` are what is done by now of a scene's sequence."""
 
     def __init__(
         self,
         gui: viser.GuiApi,
         touches: Touches,
+        folder: Path | None,
         chosen: Callable[[], tuple[str, MapScene, str, Any, int]],
         done: Callable[[Trace | None], None],
         open_query: Callable[[str], None],
     ) -> None:
-        """``chosen`` tells the scene's label, the scene, estimator, options and seed; ``done`` is called for every
-        query with its run, if it came so far; ``open_query`` shows the query of that name."""
-        self._chosen, self._done = chosen, done
+        """``folder`` has the results of ``spherloc localize``, if there is one. ``chosen`` tells the scene's label, the
+        scene, estimator, options and seed; ``done`` is called for every query with its run, if it came so far;
+        ``open_query`` shows the query of that name."""
+        self._results, self._chosen, self._done = folder, chosen, done
         self._folder = gui.add_folder("Sequence", visible=False)
         with self._folder:
             self._button = gui.add_button(START)
@@ -45,16 +49,39 @@ class SequencePanel:
         self._button.on_click(self._press)
         self._lock = threading.Lock()
         self._stop: threading.Event | None = None
-        self._label, self._rows = "", ()
+        self._rows: dict[str, tuple[QueryResult, ...]] = {}
+        """By the label of the scene."""
         self._shown: tuple[str, MapScene | None] = ("", None)
         self._hidden = False
         self._strip = QueryStrip(touches, self._show_pictures, open_query, self._complain)
 
-    def show(self, label: str, scene: MapScene | None) -> None:
-        """Show the panel for a scene with queries, and hide it for others."""
+    def show(self, label: str, scene: MapScene | None, path: Path) -> None:
+        """Show the panel for a scene with queries, whose file is ``path``, and hide it for others."""
         self._folder.visible = scene is not None
-        self._shown = label, scene
+        another, self._shown = label != self._shown[0], (label, scene)
         self._follow()
+        if not another or scene is None:
+            return
+        rows = self.rows(label)
+        self._text.content = sequence_html(rows, scene) if rows else ""
+        if not rows and self._results is not None:
+            what = self._results, label, scene, path
+            threading.Thread(target=self._read_kept, args=what, name="spherloc-kept", daemon=True).start()
+
+    def _read_kept(self, folder: Path, label: str, scene: MapScene, path: Path) -> None:
+        """Show what was localized before in a scene, if nothing is localized or has been on this page."""
+        try:
+            found = kept_results(folder, scene, path)
+        except SpherlocError:  # then there is nothing to show; the panel will say so if it is used
+            return
+        with self._lock:
+            if found is None or label in self._rows or self._shown[0] != label:
+                return
+            self._rows[label] = found.rows
+        words = f"Localized before by {found.configuration.estimator}: {shorten(found.folder.name)}."
+        self._text.content = sequence_html(found.rows, scene) + status_html(words)
+        self._follow()
+        self._done(None)
 
     def hide_answers(self, hidden: bool) -> None:
         """Hide the results, or show them again."""
@@ -77,9 +104,9 @@ class SequencePanel:
         self._text.content = status_html(sentence, wrong=True)
 
     def rows(self, label: str) -> tuple[QueryResult, ...]:
-        """Results by now, in the order of the sequence; none if the last sequence was of another scene."""
+        """Results by now, in the order of the sequence."""
         with self._lock:
-            return self._rows if label == self._label else ()
+            return self._rows.get(label, ())
 
     def close(self) -> None:
         """End after the query at hand; does not wait."""
@@ -102,11 +129,10 @@ class SequencePanel:
         try:
             label, scene, estimator, options, seed = self._chosen()
             with self._lock:
-                self._label, self._rows = label, ()
+                self._rows[label] = ()
             for row, trace in localize(scene, scene.queries, estimator, options, seed):
                 with self._lock:
-                    self._rows = (*self._rows, row)
-                    rows = self._rows
+                    rows = self._rows[label] = (*self._rows[label], row)
                 self._bar.value = 100.0 * len(rows) / len(scene.queries)
                 self._text.content = sequence_html(rows, scene)
                 self._follow()
