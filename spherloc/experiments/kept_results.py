@@ -7,7 +7,7 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError
 from spherloc.experiments.configuration import read_configuration, scene_sha256
 from spherloc.experiments.results import CONFIGURATION, SequenceResults, read_results
-from spherloc.experiments.sequence import inputs_of
+from spherloc.experiments.sequence import has_changed
 from spherloc.files import is_file, names_in
 
 
@@ -29,7 +29,7 @@ def kept_results(folder: Path, scene: MapScene, path: Path) -> SequenceResults |
     for _, place in sorted(found, reverse=True):
         with suppress(InputError):
             results = read_results(place)
-            rows = tuple(row for row in results.rows if row.query in now and row.inputs == inputs_of(now[row.query]))
+            rows = tuple(row for row in results.rows if row.query in now and not has_changed(now[row.query], row))
             if rows:
                 return SequenceResults(place, results.configuration, rows)
     return None

@@ -100,6 +100,11 @@ def localize_by_each(
             yield index, found, trace
 
 
+def has_changed(view: View, row: QueryResult) -> bool:
+    """Whether a query is not what it was when its result was made; unknown for results of earlier versions."""
+    return row.inputs is not None and row.inputs != inputs_of(view)
+
+
 def inputs_of(view: View) -> str:
     """A digest of what a query's result depends on: its camera, gravity, true pose and size of the image file."""
     down, bound = (None, None) if view.gravity is None else (view.gravity.down, view.gravity.bound_rad)

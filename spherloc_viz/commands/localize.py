@@ -29,7 +29,7 @@ from spherloc.experiments.results import (
     SequenceResults,
     folder_for,
 )
-from spherloc.experiments.sequence import INITIALISED, How, chosen_queries, inputs_of, localize_by_each
+from spherloc.experiments.sequence import INITIALISED, How, chosen_queries, has_changed, localize_by_each
 from spherloc.experiments.summary import (
     SuccessRate,
     Summary,
@@ -212,7 +212,7 @@ def _todo(scene: MapScene, chosen: Sequence[View], log: ResultsLog, retry_failed
         )
     if log.repaired:
         say(f"{log.folder}: removed a half written line; its query is done again.")
-    changed = [view.name for view in chosen if view.name in log.rows and _has_changed(view, log.rows[view.name])]
+    changed = [view.name for view in chosen if view.name in log.rows and has_changed(view, log.rows[view.name])]
     if changed:
         log.forget(changed)
         some = f"{shorten(changed[0])}{f' and {len(changed) - 1} more' if len(changed) > 1 else ''}"
@@ -223,11 +223,6 @@ def _todo(scene: MapScene, chosen: Sequence[View], log: ResultsLog, retry_failed
     if len(todo) < len(chosen):
         say(f"{log.folder}: {len(chosen) - len(todo)} of {len(chosen)} queries are done already.")
     return todo
-
-
-def _has_changed(view: View, row: QueryResult) -> bool:
-    """Whether a query is not what it was when its result was made; unknown for results of earlier versions."""
-    return row.inputs is not None and row.inputs != inputs_of(view)
 
 
 def _work(
