@@ -86,6 +86,20 @@ def test_a_phone_shows_the_canvas_and_what_the_step_says(browser: Browser, addre
     expect(captions).not_to_contain_text("Outcome")
     expect(onward).to_be_enabled()
 
+    captions.get_by_role("button", name="The view of the step: Residuals").click()
+    expect(tab.page.get_by_text("Residuals at the estimated pose")).to_be_visible()
+    expect(tab.page.get_by_role("tab", name="Play", exact=True)).not_to_be_visible()
+    title, graph = captions.locator(".step-title"), tab.page.get_by_text("Graph and matrix")
+    for _ in range(30):  # before the refinement are the steps of the balls
+        before = title.inner_text() + captions.locator(".place").inner_text()
+        captions.get_by_role("button", name="Previous step").click()
+        tab.until(lambda was=before: title.inner_text() + captions.locator(".place").inner_text() != was, "it steps")
+        if "ball" in title.inner_text():
+            break
+    expect(graph).to_be_visible()
+    captions.get_by_role("button", name="What the step says").click()
+    expect(graph).not_to_be_visible()
+
     settings = tab.page.get_by_text(re.compile("^spherloc$"))
     settings.click()
     expect(tab.page.get_by_role("tab", name="Play", exact=True)).to_be_visible()

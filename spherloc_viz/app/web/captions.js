@@ -1,6 +1,7 @@
 // Two ways of showing a step with few words, for a lecture and for a phone. On a narrow screen, and in a zoomed window,
 // the settings are folded away at the start; on a narrow one what the step says stands below the canvas, with Previous
-// and Next, and with it what is said of a match that was tapped and, at the last step, of a failure. The projector view,
+// and Next, and with it what is said of a match that was tapped and, at the last step, of a failure; a button has the
+// view that goes with the step take the place of the words. The projector view,
 // key L or an element of the class "projector-toggle", folds the panel on the right and has the view that goes with the
 // step and, in large type, what the step says and at the last one what is said of a failure on the left, for which it
 // asks the server for room (projector:WIDTH of the window). The server is told too how wide the window is (window:WIDTH).
@@ -8,13 +9,15 @@
 (() => {
   const EVERY_MS = 150, FOLDED_MS = 2000, NARROW_PX = 600, ROOMY_PX = 1000, FOLD = "Collapse panel area", UNFOLD = "Expand column";
   const DESELECT = '<button class="deselect" data-touch="deselect:">Deselect</button>';
-  let bar = null, words = null, number = null, projector = false, folded = false, roomMade = false, foldedHere = false;
+  const SHEET = '[class*=Paper-root][style*="position: fixed; bottom: 0px"]';
+  let bar = null, words = null, number = null, turn = null;
+  let projector = false, viewing = false, folded = false, roomMade = false, foldedHere = false;
   let toldWidth = 0, toldWindow = 0, toggledAt = -Infinity;
 
   // While the settings are unfolded on a narrow screen, they take the place of the captions.
   const small = () => innerWidth < NARROW_PX;
   const unfolded = () => [...document.querySelectorAll("[data-ready]")].some((one) => one.getClientRects().length > 0);
-  const narrow = () => small() && folded && !unfolded();
+  const narrow = () => small() && folded && (viewing || !unfolded());
   const tell = (detail) => dispatchEvent(new CustomEvent("spherloc-touch", { detail }));
   const ofRightColumn = (label) =>
     document.querySelector(`[style*="top: 0px; bottom: 0px; right: 0px"] [aria-label="${label}"]`);
@@ -52,7 +55,9 @@
     close.className = "close";
     number = document.createElement("span");
     number.className = "place";
-    row.append(number, close);
+    turn = button("", "", turnOver);
+    turn.className = "turn";
+    row.append(turn, number, close);
     bar.append(words, row);
     document.body.append(bar);
   }
@@ -91,8 +96,7 @@
 
   // The canvas of a narrow screen ends where the unfolded settings begin, so that a slider moves what can be seen.
   function leaveRoom() {
-    const sheet = '[class*=Paper-root][style*="position: fixed; bottom: 0px"]';
-    const found = small() && unfolded() ? document.querySelector(sheet) : null;
+    const found = small() && unfolded() && !viewing ? document.querySelector(SHEET) : null;
     document.body.classList.toggle("unfolded", found !== null);
     if (found) document.body.style.setProperty("--canvas", `${Math.round(found.getBoundingClientRect().top)}px`);
   }
@@ -110,10 +114,33 @@
   // Once, when the page is ready: what is on the screen first is the scene.
   function foldSettings() {
     if (folded || !small() || !document.querySelector("[data-ready]")) return;
+    folded = pressTitle();
+  }
+
+  function pressTitle() {
     const title = [...document.querySelectorAll("div")].find((one) => !one.childElementCount && one.textContent === "spherloc");
-    if (!title) return;
-    folded = true;
-    title.click();
+    title?.click();
+    return title !== undefined;
+  }
+
+  // Where the words of the step stand on a narrow screen, the views are shown, or the words again: the same sheet as the
+  // settings', of which nothing else is to be seen.
+  function turnOver() {
+    viewing = !viewing;
+    pressTitle();
+    look();
+  }
+
+  function showViews() {
+    if (viewing && !small()) viewing = false;
+    document.body.classList.toggle("views", viewing);
+    if (turn) {
+      const view = document.querySelector("[data-front]")?.dataset.front || "Views";
+      turn.textContent = viewing ? "Words" : view;
+      turn.setAttribute("aria-label", viewing ? "What the step says" : `The view of the step: ${view}`);
+    }
+    const views = viewing ? document.querySelector("[data-view=Yaw]")?.closest("[class*=Tabs-root]") : null;
+    if (views?.getClientRects().length && !views.querySelector("[role=tab]")) views.firstElementChild.click();
   }
 
   // In a window that is not that narrow, as a zoomed one, two panels would leave a strip of the canvas: the right one is
@@ -131,10 +158,12 @@
 
   function look() {
     if (!document.body) return; // the page is still being read
+    if (!small() && !projector) folded = false; // viser unfolds them when the window is narrow again
     foldSettings();
     makeRoom();
     const wanted = (projector || narrow()) && document.querySelector(".step-words") && !document.querySelector(".introduction");
     document.body.classList.toggle("narrow", narrow());
+    showViews();
     leaveRoom();
     if (!wanted) {
       bar?.remove();

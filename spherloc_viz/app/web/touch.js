@@ -46,11 +46,12 @@
   }
 
   // Opens a tab of the views; false as long as it is not to be seen, as while the page is built or its panel is folded.
-  // Tabs can be dragged, so that a click does nothing; Enter is what their own keys know.
+  // Tabs can be dragged, so that a click does nothing; Enter is what their own keys know. On a phone it is the other way.
   function openTab(name) {
     if ((seen ?? "").split(",").includes(name)) return true;
     const tab = [...document.querySelectorAll("[role=tab]")].find((one) => one.textContent.trim() === name);
     tab?.dispatchEvent(new KeyboardEvent("keydown", { key: "Enter", bubbles: true, cancelable: true }));
+    if (document.body.classList.contains("views")) tab?.click();
     return false;
   }
 
