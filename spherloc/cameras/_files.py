@@ -2,6 +2,7 @@
 
 import json
 import re
+import xml.etree.ElementTree as xml
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from spherloc.cameras._checks import coefficients, finite, located
 from spherloc.errors import MAX_REASON, CalibrationError, InputError, reason, shorten, show
 from spherloc.files import names_in, read_file
 
-CALIBRATION_NAME = re.compile(r"(calib|cam|lens|sensors|transforms).*\.(json|toml|txt|ya?ml)$", re.IGNORECASE)
+CALIBRATION_NAME = re.compile(r"(calib|cam|lens|sensors|transforms).*\.(json|toml|txt|xml|ya?ml)$", re.IGNORECASE)
 """Usual names of calibration files."""
 
 MAX_FILE_BYTES = 256 * 1024
@@ -24,8 +25,8 @@ PIXEL_CENTRE_SHIFT = 0.5
 """Added to a principal point that counts from the centre of the top-left pixel."""
 
 KNOWN = (
-    "give a YAML of KITTI-360, Kalibr, EuRoC, stella, OpenCV, ROS or 360Loc, a JSON of Basalt, Project Aria or "
-    "nerfstudio, COLMAP's cameras.txt, kapture's sensors.txt, an OCamCalib text or a TOML with a [camera] table "
+    "give a YAML of KITTI-360, Kalibr, EuRoC, stella, ROS or 360Loc, a file of OpenCV, a JSON of Basalt, Project Aria "
+    "or nerfstudio, COLMAP's cameras.txt, kapture's sensors.txt, an OCamCalib text or a TOML with a [camera] table "
     "(docs/conventions.md has its keys)"
 )
 
@@ -121,6 +122,29 @@ def parse_json(text: str) -> Any:
         raise UnrecognisedError(f"line {error.lineno} is not valid JSON ({error.msg}): correct it.") from None
     except (ValueError, RecursionError) as error:
         raise UnrecognisedError(f"a value is not valid JSON ({reason(error)}): correct it.") from None
+
+
+def parse_opencv_xml(text: str) -> dict[str, Any]:
+    """The document of an XML text of OpenCV's FileStorage, as its YAML would be read; raises ``CalibrationError`` for
+    another XML, with the line if it is not valid."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise CalibrationError("defines entities, which calibrations have no use for: write the values themselves.")
+    try:
+        root = xml.fromstring(text)
+    except xml.ParseError as error:
+        raise UnrecognisedError(f"line {error.position[0]} is not valid XML ({reason(error)}): correct it.") from None
+    if root.tag != "opencv_storage":
+        raise UnrecognisedError(f"this XML is a {show(root.tag)}, not OpenCV's 'opencv_storage': {KNOWN}.")
+    return {str(node.tag): _opencv_value(node) for node in root}
+
+
+def _opencv_value(node: xml.Element) -> Any:
+    """A matrix as a table of rows, cols, dt and data, and of any other node the number or the text."""
+    if node.get("type_id") != "opencv-matrix":
+        words = (node.text or "").strip().strip('"')
+        return int(words) if words.isascii() and words.isdigit() and len(words) < 10 else words
+    table: dict[str, Any] = {str(part.tag): (part.text or "").strip() for part in node}
+    return table | {"data": table.get("data", "").split()}
 
 
 def table_of(value: Any) -> dict[Any, Any]:

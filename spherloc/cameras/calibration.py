@@ -12,7 +12,16 @@ from typing import Any
 
 from spherloc.cameras import json_files, ocam_files, tool_files
 from spherloc.cameras._checks import located
-from spherloc.cameras._files import KNOWN, UnrecognisedError, parse_json, parse_yaml, read_text, table_of, value_of
+from spherloc.cameras._files import (
+    KNOWN,
+    UnrecognisedError,
+    parse_json,
+    parse_opencv_xml,
+    parse_yaml,
+    read_text,
+    table_of,
+    value_of,
+)
 from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_text import colmap_lines, colmap_text
 from spherloc.cameras.extensions import camera_class_of, read_by_extensions, tried
@@ -26,9 +35,10 @@ _ONE_CAMERA = {
     "Camera": tool_files.stella,
     "intrinsics": tool_files.euroc,
     "distortion_coefficients": opencv,
+    "Distortion_Coefficients": opencv,
     "D": opencv,
 }
-"""Readers of YAML files of one camera without a name, by the top-level key by which the kind is recognised."""
+"""Readers of files of one camera without a name, by the top-level key by which the kind is recognised."""
 
 _YAML_KEY = re.compile(r"""["']?[\w.-]+["']?\s*:(\s|$)""")
 
@@ -38,7 +48,7 @@ def load_camera(path: str | Path, name: str | None = None) -> Camera:
 
     The kind is recognised by the content: a KITTI-360 YAML (``model_type: MEI``), a Kalibr camchain (``cam0``, ...:
     pinhole or omni with radtan, equidistant or none, ds, eucm), the YAML of stella_vslam (``Camera``), 360Loc
-    (``imgw``) and fisheye-calib-adapter (``parameter``), that of OpenCV's samples and of ROS
+    (``imgw``) and fisheye-calib-adapter (``parameter``), that of ROS and the YAML, XML or JSON of OpenCV's samples
     (``distortion_coefficients``), a Basalt JSON (``value0``), a JSON of cameras by name (``model``, ``params``),
     nerfstudio's ``transforms.json`` (``fl_x``), COLMAP's ``cameras.txt``, OCamCalib's ``calib_results.txt`` and a TOML
     with a ``[camera]`` table or with its keys at the top. ``name`` picks one of ``camera_names``, by default the first
@@ -97,6 +107,8 @@ def _own_kind(path: Path, name: str | None) -> Camera:
     text = read_text(path)
     if text.lstrip().startswith("{"):
         return _from_json(parse_json(text), name)
+    if text.lstrip().startswith("<"):
+        return _one_camera(parse_opencv_xml(text), name, "XML")
     if ocam_files.is_ocam(text):
         _refuse_name(name)
         return ocam_files.ocam(text)
@@ -123,7 +135,7 @@ def _from_json(document: Any, name: str | None) -> Camera:
     if json_files.is_transforms(document):
         _refuse_name(name)
         return json_files.transforms(document)
-    raise UnrecognisedError(f"this JSON has neither 'value0', cameras with 'model' and 'params', nor 'fl_x': {KNOWN}.")
+    return _one_camera(document, name, "JSON")
 
 
 def _from_yaml(document: Any, name: str | None) -> Camera:
@@ -136,13 +148,19 @@ def _from_yaml(document: Any, name: str | None) -> Camera:
             raise CalibrationError(f"has no camera {show(name)}: choose one of {', '.join(chain)}.")
         name = name or next(iter(chain))
         return tool_files.camera_of(name, chain[name])
+    return _one_camera(document, name, "YAML")
+
+
+def _one_camera(document: Any, name: str | None, kind: str) -> Camera:
+    """The camera of a document that has one, without a name; raises ``UnrecognisedError`` if it has no known key."""
+    keys = {str(key) for key in document} if isinstance(document, dict) else set()
     if any(key.startswith(tool_files.STELLA_PREFIX) for key in keys):
         keys.add("Camera")
     for mark, read in _ONE_CAMERA.items():
         if mark in keys:
             _refuse_name(name)
             return read(document)
-    raise UnrecognisedError(f"this YAML has neither 'model_type' nor 'cam0', nor any other known key: {KNOWN}.")
+    raise UnrecognisedError(f"this {kind} has no known key at its top: {KNOWN}.")
 
 
 def _from_toml(text: str, name: str | None) -> Camera:

@@ -353,12 +353,22 @@ _MAX_SKEW = 1e-6
 """Largest skew of a camera matrix, as a share of the focal length."""
 
 
+OPENCV_2 = {
+    "Distortion_Coefficients": "distortion_coefficients",
+    "Camera_Matrix": "camera_matrix",
+    "image_Width": "image_width",
+    "image_Height": "image_height",
+}
+"""Keys of the samples of OpenCV 2, and what they are called since."""
+
+
 def opencv(document: dict[Any, Any]) -> Camera:
     """A pinhole, a fisheye (``fisheye_model: 1``, or ROS's ``distortion_model: equidistant``) or MEI (``xi``).
     Its matrices are called as OpenCV's samples call them, or K and D.
 
     Raises ``CalibrationError`` for another file, and if its four coefficients may be those of a fisheye or a pinhole.
     """
+    document = {OPENCV_2.get(key, key): value for key, value in document.items()}
     size = value_of(document, "image_width"), value_of(document, "image_height")
     matrix, coefficients = ("K", "D") if "D" in document else ("camera_matrix", "distortion_coefficients")
     with located(matrix):

@@ -34,7 +34,7 @@ UNREAD = {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gpr", ".heic", ".heif", ".i
 """Endings of photographs that OpenCV does not read."""
 MAX_NAMED = 3
 """Largest number of names in a remark."""
-CALIBRATIONS = (".yaml", ".yml", ".json", ".toml", ".txt")
+CALIBRATIONS = (".yaml", ".yml", ".json", ".toml", ".txt", ".xml")
 CALLED_CALIBRATION = re.compile("calib|camera|camchain|intrinsic|sensor|lens|cam[0-9]*$")
 """Names of files that are taken for calibrations, so that one that cannot be read is told."""
 MAX_CALIBRATIONS = 20

@@ -14,9 +14,9 @@ RADIAL = np.array([-0.2, 0.05, 0.001, -0.002])
 FISHEYE = np.array([0.02, -0.01, 0.003, -0.0005])
 
 
-def written(folder, lens, **others):
+def written(folder, lens, kind="yml", **others):
     """A file by OpenCV's FileStorage."""
-    path = folder / "camera.yml"
+    path = folder / f"camera.{kind}"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write("calibration_time", "Mon 1 Jan 2024")
     for name, value in {"image_width": 640, "image_height": 480, **others}.items():
@@ -45,6 +45,38 @@ def test_a_fisheye_as_opencv_projects_it(tmp_path):
     there = cv2.fisheye.projectPoints(places[:, None], np.zeros(3), np.zeros(3), MATRIX, FISHEYE)[0][:, 0]
     assert isinstance(camera, KannalaBrandt) and (camera.width, camera.height) == (640, 480)
     np.testing.assert_allclose(camera.project(places)[0], there + 0.5, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["xml", "json"])
+def test_other_forms_of_a_file_hold_the_same(tmp_path, kind):
+    for lens, others in ((FISHEYE, {"fisheye_model": 1}), (RADIAL, {"xi": 1.25, "note": "a < b & c"})):
+        assert load_camera(written(tmp_path, lens, kind, **others)) == load_camera(written(tmp_path, lens, **others))
+
+
+def test_the_keys_of_opencv_2(tmp_path):
+    path = written(tmp_path, RADIAL, "xml", distortion_model="plumb_bob")
+    wanted = load_camera(path)
+    for key in ("camera_matrix", "distortion_coefficients", "image_width", "image_height"):
+        path.write_text(path.read_text().replace(key, "_".join(map(str.capitalize, key.split("_")))))
+    path.write_text(path.read_text().replace("Image_", "image_"))
+    assert "<Camera_Matrix" in path.read_text() and load_camera(path) == wanted
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("<opencv_storage><image_width>640", "line 1 is not valid XML"),
+        ("<calibration><f>400</f></calibration>", "a 'calibration', not OpenCV's 'opencv_storage'"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage>&b;</opencv_storage>', "defines entities"),
+        ("<opencv_storage><image_width>640</image_width></opencv_storage>", "this XML has no known key at its top"),
+        ("<opencv_storage><image_width>640</image_width><K>1</K><D>2</D></opencv_storage>", "image_height"),
+    ],
+)
+def test_another_xml_is_told(tmp_path, text, told):
+    path = tmp_path / "camera.xml"
+    path.write_text(text)
+    with pytest.raises(CalibrationError, match=told):
+        load_camera(path)
 
 
 def test_mei_has_its_mirror(tmp_path):

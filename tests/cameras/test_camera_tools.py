@@ -134,7 +134,7 @@ def test_real_kannala_brandt_files(name):
 
 def test_real_files_without_a_usable_camera_are_refused():
     path = require_shared("formats_real/tumvi_kalibr_imu_chain.yaml")
-    with pytest.raises(CalibrationError, match="neither 'model_type' nor 'cam0'"):
+    with pytest.raises(CalibrationError, match="this YAML has no known key at its top"):
         load_camera(path)
     with pytest.raises(CalibrationError, match=r"has no 'cam0' at its top: give a camchain YAML of Kalibr\.$"):
         read_kalibr_chain(path)
@@ -257,7 +257,7 @@ def test_each_format_and_its_pixel_centre(written, text, name, expected):
         ("parameter: 3", None, "key 'image' is missing"),
         ("image: 3\nparameter: 3", None, "image: the camera is 3"),
         ("image: {width: 3, height: 3}\nparameter: 3", None, "parameter: the camera is 3"),
-        ("{}", None, "this JSON has neither 'value0', cameras with 'model' and 'params', nor 'fl_x'"),
+        ("{}", None, "this JSON has no known key at its top"),
         ("{]", None, "line 1 is not valid JSON (Expecting property name"),
         ('{"value0": ' + "[" * 100_000, None, "a value is not valid JSON (maximum recursion depth exceeded"),
         ('{"value0": ' + "9" * 10_000 + "}", None, "a value is not valid JSON (Exceeds the limit"),
