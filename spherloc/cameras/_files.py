@@ -2,9 +2,9 @@
 
 import json
 import re
-import xml.etree.ElementTree as xml
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import yaml
 
@@ -130,15 +130,15 @@ def parse_opencv_xml(text: str) -> dict[str, Any]:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise CalibrationError("defines entities, which calibrations have no use for: write the values themselves.")
     try:
-        root = xml.fromstring(text)
-    except xml.ParseError as error:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
         raise UnrecognisedError(f"line {error.position[0]} is not valid XML ({reason(error)}): correct it.") from None
     if root.tag != "opencv_storage":
         raise UnrecognisedError(f"this XML is a {show(root.tag)}, not OpenCV's 'opencv_storage': {KNOWN}.")
     return {str(node.tag): _opencv_value(node) for node in root}
 
 
-def _opencv_value(node: xml.Element) -> Any:
+def _opencv_value(node: ElementTree.Element) -> Any:
     """A matrix as a table of rows, cols, dt and data, and of any other node the number or the text."""
     if node.get("type_id") != "opencv-matrix":
         words = (node.text or "").strip().strip('"')
