@@ -1,11 +1,11 @@
 // Two ways of showing a step with few words, for a lecture and for a phone. On a narrow screen, and in a zoomed window,
 // the settings are folded away at the start; on a narrow one what the step says stands below the canvas, with Previous
 // and Next, and with it what is said of a match that was tapped and, at the last step, of a failure; a button has the
-// view that goes with the step take the place of the words. The projector view,
-// key L or an element of the class "projector-toggle", folds the panel on the right and has the view that goes with the
-// step and, in large type, what the step says and at the last one what is said of a failure on the left, for which it
-// asks the server for room (projector:WIDTH of the window). The server is told too how wide the window is (window:WIDTH).
-// At either end of the steps the button that leads on is disabled, in the panel too.
+// view that goes with the step take the place of the words. The projector view, key L (Escape ends it) or an element of
+// the class "projector-toggle", folds the panel on the right and has the view that goes with the step and, in large
+// type, what the step says and at the last one what is said of a failure on the left, for which it asks the server for
+// room (projector:WIDTH of the window). The server is told too how wide the window is (window:WIDTH). At either end of
+// the steps the button that leads on is disabled, in the panel too.
 (() => {
   const EVERY_MS = 150, FOLDED_MS = 2000, NARROW_PX = 600, ROOMY_PX = 1000, FOLD = "Collapse panel area", UNFOLD = "Expand column";
   const DESELECT = '<button class="deselect" data-touch="deselect:">Deselect</button>';
@@ -195,7 +195,10 @@
   addEventListener("keydown", (event) => {
     const writing = event.target instanceof Element
       && event.target.closest("input:not([type=checkbox]):not([type=radio]),textarea,select,[contenteditable=true]");
-    if (writing || event.ctrlKey || event.metaKey || event.altKey || event.key.toLowerCase() !== "l") return;
+    // The first press of Escape deselects a match.
+    const leaves = event.key === "Escape" && projector && !document.querySelector(".match-words,[role=dialog]");
+    if (writing || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.key.toLowerCase() !== "l" && !leaves) return;
     event.preventDefault();
     toggle();
   }, true);
