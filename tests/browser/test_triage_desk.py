@@ -182,6 +182,18 @@ def test_a_wide_screen_shows_all_larger_and_brushes_the_same(desk: Desk) -> None
     np.testing.assert_allclose(*ranges, atol=0.02 * SEEDS)
 
 
+def test_cells_stand_below_their_titles_and_a_phone_shows_the_runs_first(desk: Desk) -> None:
+    lefts = "name => [...document.querySelectorAll(`#table [role=${name}]`)].map(one => one.getBoundingClientRect().x)"
+    for width_px in (2400, 1000, 390):
+        desk.page.set_viewport_size({"width": width_px, "height": 800})
+        desk.listed(2 * SEEDS)
+        titles, cells = (desk.page.evaluate(lefts, name) for name in ("columnheader", "gridcell"))
+        assert len(titles) > 8 and np.allclose(titles, cells[: len(titles)], atol=0.5)
+        assert desk.page.evaluate("document.documentElement.scrollWidth") <= width_px
+    runs, groups = (desk.page.locator(name).bounding_box() for name in ("#table", "#matrix"))
+    assert runs is not None and groups is not None and runs["y"] + runs["height"] <= groups["y"]
+
+
 def test_unknown_values_can_be_brushed(desk: Desk) -> None:
     desk.page.locator("#plot-x").select_option("certificate_gap")  # which mc does not have
     box = desk.page.locator("#scatter").bounding_box()

@@ -6,10 +6,11 @@ const FILTERS = ["outcome", "diagnosis", "estimator", "scene", "source", "labels
 const GROUPED = ["diagnosis", "scene", "estimator", "outcome", "changes", "source", "name"];
 const MAX_CHIPS = 6, ALL_CHIPS = 40, MAX_GROUP_COLUMNS = 6, EXAMPLES = 4, ROW_PX = 34;
 const WIDTHS = {
-  outcome: 80, diagnosis: 150, scene: 140, name: 190, changes: 150, labels: 150, title: 190, created: 110, query: 120, estimator: 112,
-  outlier_rate: 64, rotation_error_deg: 74, translation_error_m: 78, rotation_sd_deg: 74, position_sd_m: 78, certificate_gap: 84,
-  time_ms: 62, correspondences: 60, inliers: 60, seed: 56, steps: 56, key_step: 60,
+  outcome: 90, diagnosis: 138, scene: 128, name: 190, changes: 150, labels: 150, title: 190, created: 110, query: 120, estimator: 104,
+  outlier_rate: 60, rotation_error_deg: 72, translation_error_m: 78, rotation_sd_deg: 74, position_sd_m: 104, certificate_gap: 80,
+  time_ms: 60, correspondences: 60, inliers: 60, seed: 56, steps: 56, key_step: 60,
 };
+const MARK_AND_PICTURE_PX = 84;
 const DEFAULT_KEYS = ["real failure", "bad map", "bad truth", "calibration", "repeated structure", "look again", "known", "fixed", "ignore"];
 const SEEN = "seen";
 const NEWS_MS = 15000;
@@ -291,15 +292,18 @@ function select(id, names, name) {
 
 // --- table ---------------------------------------------------------------------------------------------------------
 
+// The columns share the room that is left, each by its own width.
 const width = (name) => WIDTHS[name] || 90;
+const room = (name) => `flex:${width(name)} 0 ${width(name)}px;min-width:0`;
 
 function drawHead() {
   const cells = state.columns.map((name) => element("button", {
-    className: runs.isNumber(name) && name !== "created" ? "number" : "", style: `width:${width(name)}px`, title: `${SETTINGS.columns[name][1]}. Sort by it.`,
+    className: runs.isNumber(name) && name !== "created" ? "number" : "", style: room(name), title: `${SETTINGS.columns[name][1]}. Sort by it.`,
     textContent: title(name) + (state.sort === name ? (state.descending ? " ↓" : " ↑") : ""), role: "columnheader",
     "aria-sort": state.sort === name ? (state.descending ? "descending" : "ascending") : "none",
     onclick: () => change({ sort: name, descending: state.sort === name ? !state.descending : runs.isNumber(name) }),
   }));
+  byId("table").style.setProperty("--columns", `${state.columns.reduce((sum, name) => sum + width(name), MARK_AND_PICTURE_PX)}px`);
   byId("head").replaceChildren(element("span", { className: "mark", role: "columnheader", "aria-label": "Marked" }),
     element("span", { className: "picture", role: "columnheader", "aria-label": "Picture" }), ...cells);
 }
@@ -320,7 +324,7 @@ function drawRows() {
 function row(i) {
   const cells = state.columns.map((name) => {
     const value = runs.value(name, i), isNumber = typeof value === "number" && name !== "created";
-    const cell = element("span", { className: isNumber ? "number" : "", style: `width:${width(name)}px`, role: "gridcell" });
+    const cell = element("span", { className: isNumber ? "number" : "", style: room(name), role: "gridcell" });
     if (name === "labels") for (const label of runs.labels[i]) cell.append(element("span", { className: "label", textContent: label }));
     else if (name === "outcome") cell.append(element("span", { className: "dot", style: `background:${SETTINGS.colors[value]}` }), value);
     else cell.textContent = shown(name, name === "scene" ? short(value) : value) + (runs.saysUnit(name, i) ? " units" : "");
