@@ -1,11 +1,14 @@
 """Says in words where a query was taken, compared with the images of its map."""
 
+from pathlib import Path
+
 import numpy as np
 
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import shorten
 from spherloc.geometry import camera_centre
 from spherloc.trace import Trace
+from spherloc.types import FloatArray
 from spherloc_viz.layers.frame import length_text
 
 NAMED = 2
@@ -19,16 +22,21 @@ def where_taken(scene: MapScene, trace: Trace) -> str:
     empty without a pose."""
     if trace.cam_from_map is None:
         return ""
-    here = camera_centre(trace.cam_from_map)
-    others = [view for view in scene.references if view.path != trace.problem.image]
-    posed = [(view.name, view.cam_from_map) for view in others if view.cam_from_map is not None]
-    apart_m = [(float(np.linalg.norm(camera_centre(pose) - here)), name) for name, pose in posed]
-    if not apart_m:
+    image = trace.problem.image
+    told = nearest(scene, trace.cam_from_map, image)
+    if not told:
         return ""
-    told = " and ".join(
-        f"{length_text(metres, scene.metric)} from {shorten(name, MAX_LETTERS)}"
-        for metres, name in sorted(apart_m)[:NAMED]
-    )
     truth = trace.problem.truth_cam_from_map
-    more = " It is an image of the map itself." if len(others) < len(scene.references) else ""
+    more = " It is an image of the map itself." if any(view.path == image for view in scene.references) else ""
     return f"Taken {told}.{more}" + ("" if truth is None else " Its truth is the pose that the map's files give it.")
+
+
+def nearest(scene: MapScene, cam_from_map: FloatArray, image: Path | None) -> str:
+    """How far a pose (3, 4) is from the nearest references other than ``image``; empty if none of them has a pose."""
+    here = camera_centre(cam_from_map)
+    others = [view for view in scene.references if view.path != image]
+    posed = [(view.name, view.cam_from_map) for view in others if view.cam_from_map is not None]
+    apart_m = sorted((float(np.linalg.norm(camera_centre(pose) - here)), name) for name, pose in posed)
+    return " and ".join(
+        f"{length_text(metres, scene.metric)} from {shorten(name, MAX_LETTERS)}" for metres, name in apart_m[:NAMED]
+    )

@@ -17,9 +17,9 @@ from spherloc.experiments.sequence import localize
 from spherloc.frontend.gravity_from_lines import NOT_FOUND
 from spherloc.frontend.view import Gravity, Matches, View
 from spherloc.geometry import DOWN
-from spherloc_viz.commands.localize import _without_lines as without_lines
-from spherloc_viz.commands.localize import gravity_by_source as summed_up
 from spherloc_viz.commands.run import as_record, as_text
+from spherloc_viz.commands.sequence_text import gravity_by_source as summed_up
+from spherloc_viz.commands.sequence_text import without_lines
 from tests.datasets.test_image_folder import CAMERA, POSED, make_tree
 from tests.tiny_scene import write_tiny_scene
 

@@ -189,6 +189,8 @@ def test_one_command_localizes_new_photographs(walk, tmp_path, monkeypatch, caps
     assert map_command(images, distance=("reference_002.png", "reference_003.png", "3"), **given) == 0
     told = capsys.readouterr().out
     assert "5 of 5 queries are localized" in told and f"written to {results}" in told
+    (place,) = (line for line in told.splitlines() if line.startswith("  reference_002.png: localized, at ("))
+    assert "3 m from reference_003.png" in place and re.search(r", \d+ of \d+ matches agree", place)
     assert told.splitlines()[-1] == f"see it        spherloc play {Path('map') / images.name}.toml"
     assert len(list((results / "recordings").glob("*.rrd"))) == 5
     assert map_command(images, **given) == 0

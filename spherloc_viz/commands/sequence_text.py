@@ -1,0 +1,185 @@
+"""What ``spherloc localize`` prints of a sequence."""
+
+from collections.abc import Iterator, Sequence
+from statistics import median
+
+from spherloc.datasets.map_scene import MapScene
+from spherloc.diagnosis.causes import Cause
+from spherloc.errors import shorten
+from spherloc.experiments.configuration import Configuration
+from spherloc.experiments.results import LOCALIZED, PICTURE, POSED, UNREADABLE, QueryResult, SequenceResults
+from spherloc.experiments.sequence import INITIALISED
+from spherloc.experiments.summary import SuccessRate, Summary, TrajectoryError, timed
+from spherloc.frontend.gravity_from_lines import why_not_found
+from spherloc.frontend.pipeline import NO_POINT
+from spherloc_viz.layers.where_taken import nearest
+
+MAX_TOLD, MAX_EACH = 5, 20
+
+
+def sequence_text(results: SequenceResults, summary: Summary, scene: MapScene) -> str:
+    """The summary as text for users."""
+    setting = results.configuration
+    lines = [
+        f"{setting.name} ({setting.scene}), {setting.estimator}, seed {setting.seed}",
+        f"  {summary.localized} of {summary.done} queries are localized, {summary.doubtful} more have a doubtful pose"
+        + (f", of {summary.queries} in the scene" if summary.done < summary.queries else ""),
+    ]
+    if not setting.metric:
+        lines.append("  units are unknown: lengths are in units of the map, and so are the limits")
+    first = sum(any(remark.startswith(INITIALISED) for remark in row.remarks) for row in results.rows)
+    if first:
+        lines.append(f"  {first} initialised by {setting.options['initialise']}, the others tracked")
+    lines += [f"  {line}" for line in _wrong(results)]
+    rates = (*summary.success, *summary.registration_success)
+    lines += [f"  success {_rate(rate, setting.unit)}" for rate in rates if rate.judged or not summary.without_truth]
+    if summary.median_rotation_error_deg is not None and summary.median_translation_error_m is not None:
+        lines.append(
+            f"  median error {summary.median_rotation_error_deg:.3f} deg and "
+            f"{setting.length(summary.median_translation_error_m)}, of queries with a pose"
+        )
+    lines += [f"  {line}" for line in _trajectory_lines(summary.trajectory, setting)]
+    if summary.median_registration_error_m is not None:
+        lines.append(f"  median registration error {setting.length(summary.median_registration_error_m)}")
+    if summary.mean_f1 is not None:
+        lines.append(
+            f"  inliers against matches within 8 px of the truth: mean precision {summary.mean_precision:.3f}, "
+            f"recall {summary.mean_recall:.3f}, F1 {summary.mean_f1:.3f}"
+        )
+    if summary.median_estimating_ms is not None:
+        lines.append(
+            f"  median time {summary.median_matching_ms or 0:.0f} ms for matching, "
+            f"{summary.median_estimating_ms:.1f} ms for estimating"
+        )
+    lines += [f"  {line}" for line in (*gravity_by_source(results.rows), *without_lines(results.rows))]
+    lines += [
+        f"  {line}"
+        for line in (*_skipped(summary), *_each(results, scene), *_without_pose(results.rows), *_remarks(results.rows))
+    ]
+    if not timed(results):
+        lines.append("  trajectory: times are places in the sequence, as the queries have no growing times")
+    if (picture := results.folder / PICTURE).exists():
+        lines.append(f"  picture: {picture}")
+    return "\n".join([*lines, f"  written to {results.folder}"])
+
+
+def _wrong(results: SequenceResults) -> Iterator[str]:
+    """A line on the queries that are localized with an error beyond all limits of the scene."""
+    limits, wrong = results.configuration.thresholds, []
+    for row in results.rows:
+        turned, moved = row.rotation_error_deg, row.translation_error_m
+        if row.status != LOCALIZED or turned is None or moved is None or not limits:
+            continue
+        if all(turned > degrees or moved > metres for degrees, metres in limits):
+            wrong.append(f"{row.query}: {turned:.3g} deg and {results.configuration.length(moved)} off")
+    if wrong:
+        more = f"; and {len(wrong) - MAX_TOLD} more, see results.csv" if len(wrong) > MAX_TOLD else ""
+        yield f"wrong by the truth, though localized: {'; '.join(wrong[:MAX_TOLD])}{more}"
+
+
+def _each(results: SequenceResults, scene: MapScene) -> Iterator[str]:
+    """A line for each query with a pose, where these are few."""
+    posed = [row for row in results.rows if row.status in POSED]
+    if len(posed) > MAX_EACH:
+        return
+    told, images = False, {view.name: view.path for view in scene.queries}
+    for row in posed:
+        turned, moved = row.expected_rotation_error_deg, row.expected_translation_error_m
+        off = ""
+        if row.status == LOCALIZED and turned is not None and moved is not None:
+            told = True
+            off = f", expected error {turned:.2g} deg and {results.configuration.length(moved)}"
+        at = ", ".join(f"{value:.2f}" for value in row.position_m)
+        why = f" ({row.diagnosis})" if row.diagnosis not in (None, str(Cause.OK)) else ""
+        agree = f"{row.inliers or 0:,} of {row.matches or 0:,} matches agree"
+        near = nearest(scene, row.cam_from_map, images.get(row.query)) if row.cam_from_map is not None else ""
+        place = f"at ({at}), {near}" if near else f"at ({at})"
+        yield f"{row.query}: {row.status}{why}, {place}, {agree}{off}"
+    if told:
+        yield "expected errors are what the noise of the matches leaves; errors of the map and of the lens add to them"
+
+
+def _trajectory_lines(error: TrajectoryError | None, setting: Configuration) -> Iterator[str]:
+    """Lines on ATE and RPE of all poses."""
+    if error is None:
+        return
+    aligned = [
+        f"{setting.length(value)} {how}"
+        for value, how in ((error.ate_rigid_m, "aligned rigidly"), (error.ate_similarity_m, "with scale"))
+        if value is not None
+    ]
+    yield f"ATE of all {error.poses} poses: {', '.join([setting.length(error.ate_m), *aligned])}"
+    if error.rpe_m is not None:
+        yield f"RPE from pose to pose: {setting.length(error.rpe_m)}, {error.rpe_deg:.3f} deg"
+
+
+def gravity_by_source(rows: Sequence[QueryResult]) -> Iterator[str]:
+    """A line for each source of gravity: its number of queries, its bounds and its true errors."""
+    by_source: dict[str, list[QueryResult]] = {}
+    for row in rows:
+        if row.gravity_source:
+            by_source.setdefault(row.gravity_source, []).append(row)
+    for source, told in by_source.items():
+        bounds = [row.gravity_bound_deg for row in told if row.gravity_bound_deg is not None]
+        errors = [row.gravity_error_deg for row in told if row.gravity_error_deg is not None]
+        most = f" to {max(bounds):.2g}" if max(bounds) > min(bounds) else ""
+        off = f"; off the truth by {median(errors):.3g} deg in the median, {max(errors):.3g} at most" if errors else ""
+        queries = "query" if len(told) == 1 else "queries"
+        yield f"gravity from {shorten(source)} in {len(told)} {queries}, within {min(bounds):.2g}{most} deg{off}"
+
+
+def without_lines(rows: Sequence[QueryResult]) -> Iterator[str]:
+    """A line for each of the first queries whose lines gave no gravity."""
+    reasons = {row.query: why for row in rows for remark in row.remarks if (why := why_not_found(remark))}
+    for query, why in list(reasons.items())[:MAX_TOLD]:
+        yield f"no gravity from lines of {query}: {why}"
+    if len(reasons) > MAX_TOLD:
+        yield f"no gravity from lines of {len(reasons) - MAX_TOLD} more, see results.csv"
+
+
+def _remarks(rows: Sequence[QueryResult]) -> Iterator[str]:
+    """Lines on what was wrong with the files or the gravity of queries, each of which may be of several queries."""
+    about: dict[str, list[str]] = {}
+    for row in rows:
+        known = (NO_POINT, INITIALISED) if row.status in POSED else (INITIALISED,)
+        for remark in row.remarks:
+            if not why_not_found(remark) and not any(word in remark for word in known):
+                about.setdefault(remark, []).append(row.query)
+    for remark, queries in list(about.items())[:MAX_TOLD]:
+        more = f" and {len(queries) - 1} more" if len(queries) > 1 else ""
+        yield f"{queries[0]}{more}: {remark.removesuffix('.')}"
+    if len(about) > MAX_TOLD:
+        yield f"and {len(about) - MAX_TOLD} more remarks, see results.csv"
+
+
+def _rate(rate: SuccessRate, unit: str) -> str:
+    length = f"{rate.metres:g} {unit}"
+    limits = length if rate.degrees is None else f"{rate.degrees:g} deg, {length}"
+    what = "registration within " if rate.degrees is None else "within "
+    if rate.rate is None or rate.low is None or rate.high is None:
+        return f"{what}{limits}: nothing to judge"
+    interval = f"{100 * rate.low:.1f} to {100 * rate.high:.1f} %"
+    return f"{what}{limits}: {100 * rate.rate:.1f} % ({rate.successes} of {rate.judged}; 95 %: {interval})"
+
+
+def _skipped(summary: Summary) -> Iterator[str]:
+    if summary.unreadable:
+        yield f"not judged: {summary.unreadable} with an unreadable image"
+    if summary.without_truth:
+        none = not any(rate.judged for rate in summary.success)
+        yield (
+            "errors are unknown: these queries have no true poses"
+            if none
+            else f"not judged by the truth: {summary.without_truth} whose true pose is unknown"
+        )
+    if summary.not_registered:
+        yield f"not judged by registration: {summary.not_registered} that could not be registered"
+
+
+def _without_pose(rows: Sequence[QueryResult]) -> Iterator[str]:
+    lost = [row for row in rows if row.status not in POSED]
+    for row in lost[:MAX_TOLD]:
+        what = row.message if row.query in row.message else f"{row.query}: {row.message}"
+        yield f"{'unreadable' if row.status == UNREADABLE else 'no pose'}: {what}"
+    if len(lost) > MAX_TOLD:
+        yield f"and {len(lost) - MAX_TOLD} more without a pose, see results.csv"
