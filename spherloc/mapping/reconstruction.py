@@ -32,6 +32,7 @@ from spherloc.frontend.features import VERSION, Features, extract
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
+from spherloc.mapping.misplaced import without_misplaced
 from spherloc.mapping.model import Reconstruction, parted, registered, untangled, worth
 from spherloc.mapping.pairs import MIN_MATCHES, ImagePairs, relative
 from spherloc.mapping.parallel import Tell, as_completed
@@ -54,6 +55,8 @@ WIDEST_RAD = np.radians(85.0)
 """Features farther from the optical axis are left out: COLMAP's fisheyes end at 90 degrees."""
 STRONG = 0.3
 """A strong pair has this share of the matches of the best pair of either image."""
+COST_OF_MISPLACED = 3.0
+"""Number of images that a misplaced one counts against a map when two are compared."""
 _TRIES = (
     {"init_min_num_inliers": 50, "init_min_tri_angle": 4.0},
     {"init_min_num_inliers": 25, "init_min_tri_angle": 2.0},
@@ -105,7 +108,8 @@ def reconstruct(
         raise StoppedError(f"{whole}: cannot be written ({reason(error)}); {advice('go on')}.") from None
     with _database(pycolmap, whole) as database:
         found = _with_images_between(database, ids, compared, found, at_one_place, tell)
-    counts, same_place = _counts(_agreeing(found), len(views)), _counts(at_one_place, len(views))
+    agreed = _agreeing(found)
+    counts, same_place = _counts(agreed, len(views)), _counts(at_one_place, len(views))
     if counts.max(initial=0) < MIN_MATCHES:
         if same_place.max(initial=0) >= MIN_MATCHES:
             raise InputError(
@@ -125,28 +129,32 @@ def reconstruct(
             "closer to each other, half a metre to two metres apart indoors."
         )
     names = [view.name for view in views]
-    made = [_models_of(pycolmap, whole, names, ids, counts, same_place, keep, tell) for keep in (0.0, STRONG)]
-    candidates = [one for one in made if one]
+    rotations = {(names[one], names[other]): relative(geometry)[0] for (one, other), geometry in agreed.items()}
+    number_of = dict(zip(names, ids, strict=True))
+    made = [_models_of(pycolmap, whole, number_of, rotations, counts, same_place, keep, tell) for keep in (0.0, STRONG)]
+    candidates = [one for one in made if one[0]]
     if not candidates:
         raise InputError(
             f"COLMAP could not start a map from these {len(views)} photographs, although pairs of them match: they "
             "may have been taken from one place. Take them half a metre to two metres apart."
         )
-    return max(candidates, key=lambda one: worth(one[0]))
+    return max(candidates, key=lambda one: worth(one[0][0]) - COST_OF_MISPLACED * one[1])[0]
 
 
 def _models_of(
     pycolmap: Any,
     path: Path,
-    names: Sequence[str],
-    ids: Sequence[int],
+    number_of: dict[str, int],
+    rotations: Mapping[tuple[str, str], FloatArray],
     counts: NDArray[np.int64],
     same_place: NDArray[np.int64],
     keep: float,
     tell: Tell,
-) -> tuple[Reconstruction, ...]:
+) -> tuple[tuple[Reconstruction, ...], int]:
     """Models, the largest first, of the pairs with at least the share ``keep`` of the matches of either image's best
-    pair."""
+    pair, and how many images were misplaced and are left out. ``number_of`` are the ids of all images by name,
+    ``rotations`` those of all pairs."""
+    ids = list(number_of.values())
     with TemporaryDirectory() as folder:  # COLMAP uses all pairs of a database, and writes its models into a folder
         database = Path(folder) / "matches.db"
         shutil.copyfile(path, database)
@@ -159,13 +167,16 @@ def _models_of(
                     opened.delete_two_view_geometry(*_of(ids, pair))
                     opened.delete_matches(*_of(ids, pair))
         models = _models(pycolmap, database, Path(folder), len(ids), tell)
-    number_of = dict(zip(names, ids, strict=True))
-    found = []
+    found: list[Reconstruction] = []
+    misplaced = 0
     for model in models:
         poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in registered(model)}
         whole = Reconstruction(model, poses, counts, (), counts + same_place, path, number_of)
-        found += parted(whole.judged())
-    return untangled(found)
+        placed = without_misplaced(whole, rotations)
+        misplaced += len(whole.poses) - len(placed.poses)
+        if len(placed.poses) > 1:
+            found += parted(placed.judged())
+    return untangled(found), misplaced
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Maps of photographs: rendered panoramas with known poses, on the way that the command takes, and what is refused."""
 
+import copy
 import json
 import re
 import shutil
@@ -7,12 +8,13 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from spherloc import registry
 from spherloc.cameras.equirectangular import Equirectangular
@@ -30,6 +32,7 @@ from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.line_gravity import gravity_by_lines
 from spherloc.mapping.make import MapRequest, ScaleMeasurement, make_map, scale_of
+from spherloc.mapping.misplaced import without_misplaced
 from spherloc.mapping.new_queries import add_new_images, map_images
 from spherloc.mapping.photographs import (
     NewImages,
@@ -373,6 +376,10 @@ def test_each_image_of_a_rig_has_its_camera(tmp_path, rng):
         by_name.remarks
     )
     assert {view.camera.fx for view in photographs(tmp_path, {"": other}).views} == {95.0}
+    with pytest.raises(
+        InputError, match=r"first is 1\.png with 400 x 300 pixels, but the calibration is for 200 x 150"
+    ):
+        photographs(tmp_path / "up", {"": replace(other, width=200, height=150)})
 
     flat = tmp_path / "flat"
     flat.mkdir()
@@ -710,6 +717,34 @@ def test_a_lens_that_colmap_lacks_is_fitted():
     bent = Mei(640, 480, 300.0, 300.0, 320.0, 240.0, 0.5, (0.0, 0.0, 0.05, 0.05))
     with pytest.raises(CalibrationError, match="no camera model mei"):
         for_colmap(bent)
+
+
+def test_an_image_that_stands_otherwise_than_its_pairs_say_is_left_out(walk):
+    """By the rotations of its pairs in the map, or since the image that matches it best did not get into that."""
+    poses, _, _, again, *_ = walk
+    whole = again().made
+    names, place = sorted(whole.poses), {name: index for index, name in enumerate(whole.ids)}
+    pairs = [pair for pair in combinations(names, 2) if whole.matches[place[pair[0]], place[pair[1]]]]
+    rotations = {(one, other): poses[other][:, :3] @ poses[one][:, :3].T for one, other in pairs}
+    assert without_misplaced(whole, rotations) is whole
+
+    def left_out(made, angle_deg, matches):
+        turn = Rotation.from_euler("y", angle_deg, degrees=True).as_matrix()
+        turned = made.poses | {names[-1]: turn @ made.poses[names[-1]]}
+        changed = replace(made, model=copy.deepcopy(made.model), poses=turned, matches=matches)
+        return made.poses.keys() - without_misplaced(changed, rotations).poses.keys()
+
+    assert left_out(whole, 5.0, whole.matches) == set() and left_out(whole, 40.0, whole.matches) == {names[-1]}
+    first, second, last = (place[names[at]] for at in (0, 1, -1))
+    few = np.zeros_like(whole.matches)
+    for one, other, count in ((first, second, 300), (second, last, 100), (first, last, 90)):
+        few[one, other] = few[other, one] = count
+    rotations |= {(names[0], names[1]): poses[names[1]][:, :3] @ poses[names[0]][:, :3].T}
+    rotations |= {(names[0], names[-1]): poses[names[-1]][:, :3] @ poses[names[0]][:, :3].T}
+    rotations |= {(names[1], names[-1]): poses[names[-1]][:, :3] @ poses[names[1]][:, :3].T}
+    assert left_out(whole, 0.0, few) == set()
+    made = replace(whole, model=copy.deepcopy(whole.model)).without([names[1]])
+    assert names[0] in left_out(made, 0.0, few)  # 90 matches for its place, and 300 with an image that is not there
 
 
 def test_an_image_that_was_left_out_is_placed(walk, capfd):

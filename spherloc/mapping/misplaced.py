@@ -1,0 +1,51 @@
+"""Leaves out images that stand in a map otherwise than most of their matches say.
+
+The rotation between two images with many matches is seldom wrong. COLMAP places an image by the points that are in the
+map at the time: if these are of a place that looks alike, or of one plane, the image is put elsewhere, and the pairs
+that would say so no longer count.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from spherloc.geometry import rotation_angle
+from spherloc.mapping.model import Reconstruction
+from spherloc.types import FloatArray
+
+TURNED_RAD = float(np.radians(8.0))
+"""Largest angle between the rotation of a pair and that of its images in the map. Directions say less: along a facade
+that repeats itself, they are those of a camera that moved the other way."""
+
+
+def without_misplaced(made: Reconstruction, rotations: Mapping[tuple[str, str], FloatArray]) -> Reconstruction:
+    """The model without images of whose matches more speak against their place than for it.
+
+    ``rotations`` (3, 3) are those of pairs of all images, the second from the first, by their names. Matches with an
+    image of the map speak for the place if the rotation fits, else against it, and so do those with the best image that
+    did not get into the map. The worst image is left out first.
+    """
+    place = {name: index for index, name in enumerate(made.ids)}
+    poses, left_out = dict(made.poses), set[str]()
+    while len(poses) > 1:
+        balance = dict.fromkeys(poses, 0)
+        outside = dict.fromkeys(poses, 0)
+        for (one, other), rotation in rotations.items():
+            count = int(made.matches[place[one], place[other]])
+            for name, with_name in ((one, other), (other, one)):
+                if name in poses and with_name in poses:
+                    fits = _fits(poses[one], poses[other], rotation)
+                    balance[name] += count if fits else -count
+                elif name in poses:
+                    outside[name] = max(outside[name], count)
+        worst = min(poses, key=lambda name: balance[name] - outside[name])
+        if balance[worst] >= outside[worst]:
+            break
+        left_out.add(worst)
+        del poses[worst]
+    return made.without(left_out) if left_out else made
+
+
+def _fits(one: FloatArray, other: FloatArray, rotation: FloatArray) -> bool:
+    """Whether the rotations of poses (3, 4) of two images agree with that of their relative pose (3, 3)."""
+    return rotation_angle(other[:, :3] @ one[:, :3].T @ rotation.T) <= TURNED_RAD
