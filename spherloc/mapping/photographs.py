@@ -266,9 +266,13 @@ def _of_folder(
         remarks.append(lens[1])
     if rest:
         width, height = next(size for size, names in sizes.items() if rest[0] in names)
+        sizes_given = sorted({(camera.width, camera.height) for camera in given.values()})
+        those = " and ".join(f"{one} x {other}" for one, other in sizes_given[:MAX_NAMED])
+        of_another_size = bool(given) and (width, height) not in sizes_given
         remarks.append(
             f"{len(rest)} of {len(rest) + len(camera_of)} images were left out, as their camera is not known; the "
-            f"first is {shorten(rest[0])} with {width} x {height} pixels."
+            f"first is {shorten(rest[0])} with {width} x {height} pixels"
+            + (f", but the calibration is for {those}." if of_another_size else ".")
         )
     for_model: dict[str, Camera] = {}
     for camera in camera_of.values():

@@ -4,6 +4,8 @@ The map's camera centres are aligned with these positions by a similarity. Up to
 similarity has the least median of distances (Rousseeuw 1984) and is then fitted to the positions near it.
 """
 
+import csv
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -33,6 +35,8 @@ NEAR_SD = 2.5
 """Positions within this many robust standard deviations are used in the fit."""
 _COLUMNS = "image x y z in metres"
 _GPS_WORDS = ({"lat", "latitude"}, {"lon", "lng", "long", "longitude"}, {"alt", "altitude"})
+_SPACED = re.compile(r"(.*?\S)\s+([-+.\deE]+)\s+([-+.\deE]+)\s+([-+.\deE]+)(?:\s+#.*)?")
+"""A name, three numbers and perhaps a comment, with spaces between them."""
 _EQUATOR_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
 """Equatorial radius and flattening of the Earth (WGS 84)."""
 _GPS_TAGS = 0x8825
@@ -73,7 +77,7 @@ def read_positions(path: Path, views: Sequence[View]) -> Positions:
     first = next(iter(rows(path, f"rows of {_COLUMNS}, or a trajectory")), None)
     if first is None:
         raise InputError(f"{path}: is empty; give rows of {_COLUMNS}.")
-    words = _words(first[1])
+    words = first[1].partition("#")[0].replace(",", " ").split()
     if path.suffix.lower() == ".csv" and (len(words) > 8 or words[0].isdigit()):
         found = _at_times(read_euroc(path), views)
     elif len(words) == 8 and _is_number(words[0]):
@@ -90,10 +94,16 @@ def read_positions(path: Path, views: Sequence[View]) -> Positions:
 
 def _of_trajectory(path: Path, views: Sequence[View]) -> dict[str, FloatArray]:
     """Positions from the rows of a TUM trajectory, whose times may be in seconds or in nanoseconds."""
-    found: dict[str, FloatArray] = {}
-    with suppress(InputError):  # times in nanoseconds are refused as seconds: too large
+    try:
         found = _at_times(read_tum(path, "s"), views)
-    return found or _at_times(read_tum(path, "ns"), views)
+    except InputError as error:  # nanoseconds are too large for seconds
+        try:
+            return _at_times(read_tum(path, "ns"), views)
+        except InputError:
+            raise error from None
+    with suppress(InputError):
+        found = found or _at_times(read_tum(path, "ns"), views)
+    return found
 
 
 def _at_times(trajectory: Trajectory, views: Sequence[View]) -> dict[str, FloatArray]:
@@ -115,7 +125,13 @@ def _is_number(word: str) -> bool:
 
 
 def _words(text: str) -> list[str]:
-    return text.partition("#")[0].replace(",", " ").split()
+    """The words of a row, of which the first, a name, may have spaces or be in quotes."""
+    for mark in (";", "\t", ","):
+        if mark in text:
+            return [word.strip() for word in next(csv.reader([text], delimiter=mark, skipinitialspace=True))]
+    if (found := _SPACED.fullmatch(text)) is not None:
+        return [found[1].strip("\"'"), *found.groups()[1:]]
+    return text.partition("#")[0].split()
 
 
 def _of_rows(path: Path, views: Sequence[View]) -> Positions:
@@ -125,7 +141,7 @@ def _of_rows(path: Path, views: Sequence[View]) -> Positions:
     count = 0
     for number, (place, text) in enumerate(rows(path, f"rows of {_COLUMNS}")):
         words = _words(text)
-        if number == 0 and (columns := _gps_columns(words)) is not None:
+        if number == 0 and ((columns := _gps_columns(words)) is not None or _are_titles(words)):
             continue
         wanted = 4 if columns is None else max(columns) + 1
         if len(words) < wanted or (columns is None and len(words) != wanted):
@@ -147,6 +163,11 @@ def _of_rows(path: Path, views: Sequence[View]) -> Positions:
     if columns is None:
         return Positions(found, f"the positions in {shorten(path.name)}")
     return Positions(local_metres(found), f"GPS in {shorten(path.name)}", horizontal=True)
+
+
+def _are_titles(words: Sequence[str]) -> bool:
+    """Whether a row has the titles of ``image x y z``."""
+    return [word.lower() for word in words[1:]] == ["x", "y", "z"]
 
 
 def _gps_columns(words: Sequence[str]) -> list[int] | None:

@@ -131,6 +131,16 @@ def check_images_of(folder: Path, images: Path) -> None:
         raise InputError(f"{folder}: holds the map of other photographs, those in {there}; {advice('another map')}.")
 
 
+def lenses_given(views: Sequence[View]) -> dict[str, CalibratedLens]:
+    """The calibrations of images for which a file was given, by their folder in that of the map, where all images of
+    that have one."""
+    by_folder: dict[str, dict[str, Camera]] = {}
+    for view in views:
+        by_folder.setdefault(Path(view.name).parent.name, {})[repr(view.camera)] = view.camera
+    how = "Given as the calibration when the map was made."
+    return {name: (next(iter(found.values())), how) for name, found in by_folder.items() if len(found) == 1}
+
+
 def write_lenses(folder: Path, lenses: Mapping[str, CalibratedLens]) -> None:
     """Write the ``lens_path`` of lenses by name where another is there or none; raises ``OSError``."""
     for name, (camera, how) in lenses.items():

@@ -46,7 +46,15 @@ from spherloc.mapping.photographs import (
     photographs,
 )
 from spherloc.mapping.positions import read_positions
-from spherloc.mapping.scene_files import LENS, MAP_FOLDER, check_images_of, kept_lens, lens_path, write_lenses
+from spherloc.mapping.scene_files import (
+    LENS,
+    MAP_FOLDER,
+    check_images_of,
+    kept_lens,
+    lens_path,
+    lenses_given,
+    write_lenses,
+)
 from spherloc.mapping.stated_gravity import read_stated_gravity
 from spherloc.registry import require
 from spherloc.types import FloatArray
@@ -116,7 +124,7 @@ def make(
             raise
     report = target / REPORT
     try:
-        _write(report, made, found, measured)
+        _write(report, made, found, measured, cameras)
     except OSError as error:
         raise StoppedError(_unwritten(report, error)) from None
     print("\n".join(summary(made, found)))
@@ -155,8 +163,7 @@ def _lens_finder(tell: Tell, folder: Path, target: Path, new_images: Path | None
         path = lens_path(target, "" if place == folder else place.name)
         kept = kept_lens(path)
         if kept is not None and (kept.width, kept.height) == size:
-            how = "which the photographs told; that file says how surely, and without it they tell it anew"
-            return kept, f"The lens is that of {path}, {how}."
+            return kept, f"The lens is that of {path}, as before; that file says where it is from, and may be removed."
         more: list[Path] = []
         if new_images is not None and is_folder(new_images):
             new = [new_images / name for name in names_in(new_images) if is_image(name)]
@@ -173,11 +180,13 @@ def _has_size(path: Path, size: tuple[int, int]) -> bool:
         return False
 
 
-def _write(report: Path, made: Map, found: Photographs, measured: ScaleMeasurement) -> None:
-    """Write the report of a map, and beside it the calibrations that its images told and what gave its scale; raises
-    ``OSError``."""
+def _write(
+    report: Path, made: Map, found: Photographs, measured: ScaleMeasurement, given: Mapping[str, Camera]
+) -> None:
+    """Write the report of a map, and beside it the calibrations that its images told or that were ``given`` and what
+    gave its scale; raises ``OSError``."""
     report.write_text(map_report(made, found), encoding="utf-8")
-    write_lenses(report.parent, found.calibrated)
+    write_lenses(report.parent, found.calibrated or (lenses_given(found.views) if given else {}))
     keep_scale(report.parent, measured)
 
 
@@ -344,7 +353,7 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
             if measured == ScaleMeasurement():
                 measured = kept_scale(output)
             made = make_map(MapRequest(found.views, folder, measured, how=how_of()), output, _progress)
-            _write(report, made, found, measured)
+            _write(report, made, found, measured, {})
         except SpherlocError as error:
             _tell({"error": str(error)})
             return 1

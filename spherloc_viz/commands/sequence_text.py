@@ -15,6 +15,8 @@ from spherloc.frontend.pipeline import NO_POINT
 from spherloc_viz.layers.where_taken import nearest
 
 MAX_TOLD, MAX_EACH = 5, 20
+FAR = 1e5
+"""Coordinates of a wrong pose can be larger; they are rounded."""
 
 
 def sequence_text(results: SequenceResults, summary: Summary, scene: MapScene) -> str:
@@ -81,6 +83,7 @@ def _each(results: SequenceResults, scene: MapScene) -> Iterator[str]:
     """A line for each query with a pose, where these are few."""
     posed = [row for row in results.rows if row.status in POSED]
     if len(posed) > MAX_EACH:
+        yield "where each was taken is in results.csv"
         return
     told, images = False, {view.name: view.path for view in scene.queries}
     for row in posed:
@@ -89,7 +92,7 @@ def _each(results: SequenceResults, scene: MapScene) -> Iterator[str]:
         if row.status == LOCALIZED and turned is not None and moved is not None:
             told = True
             off = f", expected error {turned:.2g} deg and {results.configuration.length(moved)}"
-        at = ", ".join(f"{value:.2f}" for value in row.position_m)
+        at = ", ".join(f"{value:.2f}" if abs(value) < FAR else f"{value:.2g}" for value in row.position_m)
         why = f" ({row.diagnosis})" if row.diagnosis not in (None, str(Cause.OK)) else ""
         agree = f"{row.inliers or 0:,} of {row.matches or 0:,} matches agree"
         near = nearest(scene, row.cam_from_map, images.get(row.query)) if row.cam_from_map is not None else ""

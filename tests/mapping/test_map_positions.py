@@ -112,6 +112,24 @@ def test_rows_of_positions_and_of_gps(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "row",
+    [
+        "Foto 00 #1 ä.JPG 1 2.5 -3e0",
+        "'Foto 00 #1 ä.JPG'  1 2.5 -3  # seen from the door",
+        '"Foto 00 #1 ä.JPG", 1, 2.5, -3',
+        "image;x;y;z\nFoto 00 #1 ä.JPG;1;2.5;-3",
+        "image,x,y,z\nFoto 00 #1 ä.JPG,1,2.5,-3",
+        "Foto 00 #1 ä.JPG\t1\t2.5\t-3",
+    ],
+)
+def test_names_may_have_spaces_and_columns_titles(tmp_path, row):
+    name, path = "Foto 00 #1 ä.JPG", tmp_path / "positions.csv"
+    path.write_text(f"{row}\n", encoding="utf-8")
+    found = read_positions(path, [View(name, VIEWS[0].camera, Path(name))]).by_name
+    np.testing.assert_array_equal(found[name], [1.0, 2.5, -3.0])
+
+
+@pytest.mark.parametrize(
     ("text", "sentence"),
     [
         ("", "is empty"),
@@ -121,6 +139,8 @@ def test_rows_of_positions_and_of_gps(tmp_path):
         ("a.jpg 1 2 3\n", "none of its 1 rows names one of the 8 images"),
         (f"image lat lon\n{NAMES[0]} 97 8\n", "is not a latitude"),
         ("100.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n", "no pose at the time of any of the 8 images"),
+        ("5000.03 0 0 0 0 0 0 1\n5000.23 0 0 0 0 0 0 1\n", "no pose at the time of any of the 8 images"),
+        ("100.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n", "line 3: its time is not after"),
     ],
 )
 def test_files_that_are_refused(tmp_path, text, sentence):

@@ -13,12 +13,13 @@ from spherloc.cameras.calibration import load_camera
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.datasets import load_scene
 from spherloc.errors import InputError
+from spherloc.frontend.view import View
 from spherloc.geometry import so3_exp
 from spherloc.mapping import lens_fit
 from spherloc.mapping.image_circle import image_circle
 from spherloc.mapping.lens_fit import Circle, RadialLens, fit_lens
 from spherloc.mapping.photographs import photographs
-from spherloc.mapping.scene_files import LENS, write_lenses
+from spherloc.mapping.scene_files import LENS, lenses_given, write_lenses
 from spherloc.mapping.unknown_lens import MAX_OFF_RAD, find_lens
 from spherloc_viz.commands.map import _lens_finder
 
@@ -164,6 +165,11 @@ def test_a_map_that_is_made_again_keeps_its_lens(tmp_path):
     assert find([images / "left" / "a.png"], (400, 300))[0] == replace(lens, fx=95.0)
     write_lenses(tmp_path, {"": (lens, how)})
     assert (tmp_path / LENS).read_text().startswith("# It was found.\n")
+    views = [View(name, replace(lens, fx=fx), Path(name)) for name, fx in (("a", 91.0), ("up/a", 92.0), ("up/b", 93.0))]
+    write_lenses(tmp_path, lenses_given(views))
+    assert find([images / "a.png"], (400, 300))[0] == replace(lens, fx=91.0)
+    assert "Given as the calibration" in (tmp_path / LENS).read_text()
+    assert not (tmp_path / "lens_up.toml").exists()  # its images have two
     for name, size in (("a.png", (400, 301)), ("right/a.png", (400, 300))):
         with pytest.raises(InputError, match="too few to calibrate"):
             find([images / name], size)
