@@ -229,7 +229,8 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
     if e.best is not None:
         best = e.best.support(bound)
         if e.run is None or best > e.run.support(bound):
-            yield f"{_finder(trace, best)} a pose that {best} agree with."
+            fewer = ", fewer than with the true one" if truth is not None and truth.exact.support(bound) > best else ""
+            yield f"{_finder(trace, best)} a pose that {best} agree with{fewer}."
         if np.isfinite(e.position_sd_m):
             fixed = f"{_distance(e.position_sd_m, trace.problem.unit)} and {_deg(e.rotation_sd_rad)}"
             yield f"The {best} fix their pose to {fixed} (1 sd)."
@@ -240,10 +241,12 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
         yield f"The next pose, {away} away from the best, has {e.alternative.support(bound)}."
     if e.free is not None and np.isfinite(e.free_tilt_sd_rad):
         one, two, four = (e.free.support(factor * bound) for factor in (1, 2, 4))
+        bound_rad = e.aligned.gravity_bound_rad
+        known = f"whose bound is {_deg(bound_rad)}" if bound_rad else "which is taken as exact"
         yield (
-            f"A pose fitted without gravity has {one} within the bound, {two} within twice and {four} within four "
-            f"times of it. Its vertical is {_deg(e.free.tilt_rad)} ± {_deg(e.free_tilt_sd_rad)} from the given "
-            f"gravity, whose bound is {_deg(e.aligned.gravity_bound_rad)}."
+            f"A least-squares fit of the pose without gravity has {one} within the bound, {two} within twice and "
+            f"{four} within four times of it. Its vertical is {_deg(e.free.tilt_rad)} ± {_deg(e.free_tilt_sd_rad)} "
+            f"from the given gravity, {known}."
         )
     yield from _proofs(trace, certificate)
     if truth is not None:

@@ -123,7 +123,8 @@ def hidden_html(withheld: frozenset[str], buttons: bool) -> str:
         for answer, words in OFFERS.items()
         if answer in withheld and buttons
     )
-    return box(f'<span style="{DIM}">{line}.</span> {offers}', "font-size:12px;padding-top:.2em")
+    told = f'<div class="offered-words"><span style="{DIM}">{line}.</span> {offers}</div>'
+    return box(told, "font-size:12px;padding-top:.2em")
 
 
 def opening_html(label: str) -> str:
@@ -170,7 +171,8 @@ def summary_of(trace: Trace) -> tuple[str, list[str]]:
 def summary_html(trace: Trace, cause: str = "", why: str = "") -> str:
     """A run in one line; ``cause`` is what is wrong with it, if that is to be told, and ``why`` a sentence on that."""
     words, facts = summary_of(trace)
-    told = f"{words.capitalize()}: {cause}" if cause else words.capitalize()
+    doubt = ", but in doubt" if cause and words == "success" else ""
+    told = f"{words.capitalize()}{doubt}: {cause}" if cause else words.capitalize()
     # In a narrow line the time stands alone; under a resting pointer it says what it is the time of.
     shown = (
         f'<span title="{SOLVED.capitalize()}{AGAIN}">{escape(fact.removeprefix(SOLVED))}</span>'

@@ -154,7 +154,7 @@ def _some(view: RunView, balls: BallSet, size: int) -> Frame:
         _turned(view, balls),
         view.colors(style.UNDECIDED, (view.mask(stage.pairs[shown]), style.CLIQUE)),
         view.no_matches(),
-        note=f"Smaller balls come first, spread evenly over them. {_note(balls, shown, inside)}",
+        note=f"The smaller half of all balls comes first, evenly chosen from it. {_note(balls, shown, inside)}",
         items=items,
         focus=balls.focus(shown, inside),
     )

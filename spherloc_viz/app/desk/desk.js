@@ -159,7 +159,7 @@ function drawChips() {
         name === "outcome" ? SETTINGS.colors[value] : null)), ...more));
   }
   if (runs.pageRuns && runs.others) {
-    lines[0].append(chip("page runs", runs.pageRuns, state.pages, () => change({ pages: !state.pages }),
+    lines[0].append(chip(state.pages ? "page runs" : "show page runs", runs.pageRuns, state.pages, () => change({ pages: !state.pages }),
       "Runs that pages made by themselves and that have no label"));
   }
   const brushes = [];

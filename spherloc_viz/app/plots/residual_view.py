@@ -116,10 +116,12 @@ def _bound(histogram: Histogram, x: Scale) -> list[str]:
     parts = []
     least, median, most = (f"{value:.2g}" for value in histogram.bound)
     unit = "°" if histogram.unit == "deg" else " px"
-    words = f"bound {median}{unit}" + histogram.widened * " with gravity's error"
+    wide = histogram.widened * " with gravity's error"
+    words = f"bound {median}{unit}{wide}"
     if high - low > 1.0:
         parts.append(shapes.rect(low, TOP_PX, high - low, FOOT_PX - TOP_PX, shapes.fill(style.ESTIMATE, 0.15)))
-        words = f"median {words} ({least} to {most}{unit})"
+        span = f"{least} to {most}{unit}"
+        words = f"bound {span}{wide}" if wide else f"median {words} ({span})"
     look = shapes.stroke(style.ESTIMATE, 1.5, ' stroke-dasharray="4 3"')
     parts.append(shapes.line(middle, TOP_PX - 4, middle, FOOT_PX, look))
     half = 0.5 * shapes.text_width_px(words)

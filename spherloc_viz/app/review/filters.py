@@ -182,7 +182,8 @@ def filters_html(look: Look, counts: Counts, hidden: bool = False) -> str:
     if counts.pages:
         hint = f"Runs that pages made by themselves; the newest {PAGE_KEPT} are stored, and those that you keep"
         number = f'<span style="{DIM}">{counts.pages:,}</span>'
-        chips.append(pill(f"page runs {number}", "runs-pages:", look.pages, hint))
+        words = "page runs" if look.pages else "show page runs"
+        chips.append(pill(f"{words} {number}", "runs-pages:", look.pages, hint))
     causes = [
         _chip("diagnosis", value, value or NOT_DIAGNOSED, count, look.diagnosis)
         for value, count in counts.diagnosis

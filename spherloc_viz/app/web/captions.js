@@ -64,7 +64,7 @@
 
   // Only what is new is written: a screen reader would read it again.
   function fill() {
-    const told = [".match-words", ".step-words", ".diagnosis-words"]
+    const told = [".match-words", ".step-words", ".diagnosis-words", ".offered-words"]
       .filter((kind) => narrow() || kind !== ".match-words")
       .map((kind) => [kind, document.querySelector(kind)?.innerHTML])
       .filter(([, html]) => html)
