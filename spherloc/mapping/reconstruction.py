@@ -5,7 +5,7 @@ not only a homography: a full sphere sees more than one plane, and matches that 
 poster or a floor that looks the same elsewhere.
 
 Where places look alike, a map may take two for one (see ``model``). A second map is made from the strong pairs alone,
-and the map with more images, minus a penalty for contradictions, is taken.
+and the one with more images in all its parts, minus a penalty for contradictions, is taken.
 """
 
 import ctypes
@@ -55,8 +55,6 @@ WIDEST_RAD = np.radians(85.0)
 """Features farther from the optical axis are left out: COLMAP's fisheyes end at 90 degrees."""
 STRONG = 0.3
 """A strong pair has this share of the matches of the best pair of either image."""
-COST_OF_MISPLACED = 3.0
-"""Number of images that a misplaced one counts against a map when two are compared."""
 _TRIES = (
     {"init_min_num_inliers": 50, "init_min_tri_angle": 4.0},
     {"init_min_num_inliers": 25, "init_min_tri_angle": 2.0},
@@ -132,13 +130,14 @@ def reconstruct(
     rotations = {(names[one], names[other]): relative(geometry)[0] for (one, other), geometry in agreed.items()}
     number_of = dict(zip(names, ids, strict=True))
     made = [_models_of(pycolmap, whole, number_of, rotations, counts, same_place, keep, tell) for keep in (0.0, STRONG)]
-    candidates = [one for one in made if one[0]]
+    candidates = [models for models in made if models]
     if not candidates:
         raise InputError(
             f"COLMAP could not start a map from these {len(views)} photographs, although pairs of them match: they "
             "may have been taken from one place. Take them half a metre to two metres apart."
         )
-    return max(candidates, key=lambda one: worth(one[0][0]) - COST_OF_MISPLACED * one[1])[0]
+    # Most images in all, then in one map, then those by strong pairs.
+    return max(reversed(candidates), key=lambda models: (sum(map(worth, models)), worth(models[0])))
 
 
 def _models_of(
@@ -150,10 +149,9 @@ def _models_of(
     same_place: NDArray[np.int64],
     keep: float,
     tell: Tell,
-) -> tuple[tuple[Reconstruction, ...], int]:
+) -> tuple[Reconstruction, ...]:
     """Models, the largest first, of the pairs with at least the share ``keep`` of the matches of either image's best
-    pair, and how many images were misplaced and are left out. ``number_of`` are the ids of all images by name,
-    ``rotations`` those of all pairs."""
+    pair. ``number_of`` are the ids of all images by name, ``rotations`` those of all pairs."""
     ids = list(number_of.values())
     with TemporaryDirectory() as folder:  # COLMAP uses all pairs of a database, and writes its models into a folder
         database = Path(folder) / "matches.db"
@@ -168,15 +166,13 @@ def _models_of(
                     opened.delete_matches(*_of(ids, pair))
         models = _models(pycolmap, database, Path(folder), len(ids), tell)
     found: list[Reconstruction] = []
-    misplaced = 0
     for model in models:
         poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in registered(model)}
         whole = Reconstruction(model, poses, counts, (), counts + same_place, path, number_of)
-        placed = without_misplaced(whole, rotations)
-        misplaced += len(whole.poses) - len(placed.poses)
-        if len(placed.poses) > 1:
-            found += parted(placed.judged())
-    return untangled(found), misplaced
+        whole = without_misplaced(whole, rotations)
+        if len(whole.poses) > 1:
+            found += parted(whole.judged())
+    return untangled(found)
 
 
 @contextmanager
