@@ -58,6 +58,13 @@ def test_the_projector_view_says_each_step_in_large_type(browser: Browser, addre
     tab.page.keyboard.press("Escape")
     expect(captions).to_have_count(0)
     tab.until(lambda: abs(tab.page.evaluate(WIDTH_PX) - before) < 2, "the view beside the canvas is as it was")
+
+    # A class predicts, and then sees.
+    tab.tick("Hide answers", True)
+    tab.page.keyboard.press("l")
+    expect(captions).to_contain_text("Answers are hidden")
+    captions.get_by_role("button", name="Show the outcome").click()
+    expect(captions).to_contain_text("The truth is hidden")
     tab.expect_quiet(address)
     tab.close()
 

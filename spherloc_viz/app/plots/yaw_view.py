@@ -455,7 +455,8 @@ def caption(trace: Trace, story: YawStory, arcs: PairArcs, bars: ArcBars) -> str
     shown = int(np.count_nonzero(in_window))
     if shown < total:
         kinds = np.bincount(bars.kind[bars.owner[in_window]], minlength=len(bars.kinds)).tolist()
-        counts = ", ".join(f"{n:,} of {of:,} {name}" for n, of, name in zip(kinds, bars.total, bars.kinds, strict=True))
+        rows = zip(kinds, bars.total, bars.kinds, strict=True)
+        counts = ", ".join(f"{n:,} of {of:,} {name}" if of else f"none {name}" for n, of, name in rows)
         rule = f"{shown:,} of {total:,} arcs in this window shown, evenly chosen: {counts}."
     else:
         counts = ", ".join(f"{of:,} {name}" for of, name in zip(bars.total, bars.kinds, strict=True))
