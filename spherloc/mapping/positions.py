@@ -128,7 +128,8 @@ def _words(text: str) -> list[str]:
     """The words of a row, of which the first, a name, may have spaces or be in quotes."""
     for mark in (";", "\t", ","):
         if mark in text:
-            return [word.strip() for word in next(csv.reader([text], delimiter=mark, skipinitialspace=True))]
+            with suppress(csv.Error):  # a line end within the row
+                return [word.strip() for word in next(csv.reader([text], delimiter=mark, skipinitialspace=True))]
     if (found := _SPACED.fullmatch(text)) is not None:
         return [found[1].strip("\"'"), *found.groups()[1:]]
     return text.partition("#")[0].split()

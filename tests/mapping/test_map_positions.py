@@ -135,6 +135,7 @@ def test_names_may_have_spaces_and_columns_titles(tmp_path, row):
         ("", "is empty"),
         (f"{NAMES[0]} 1 2\n", "line 1: has 3 words; give image x y z"),
         (f"{NAMES[0]} 1 2 x\n", "line 1: 'x' is not a finite number"),
+        (f"{NAMES[0]},1,2,3\r{NAMES[1]},1,2,3\r", "line 1: has . words; give image x y z"),
         (f"{NAMES[0]} 1 2 3\n{NAMES[0]} 1 2 3\n", "line 2: .* a second time"),
         ("a.jpg 1 2 3\n", "none of its 1 rows names one of the 8 images"),
         (f"image lat lon\n{NAMES[0]} 97 8\n", "is not a latitude"),
