@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds
 from spherloc.consensus.inliers import count_inliers
-from spherloc.consensus.pair_arcs import chord
+from spherloc.consensus.pair_sinusoids import chord
 from spherloc.gauss_newton import AlignedMatches
 from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem

@@ -3,7 +3,7 @@
 Paper, Eq. 24-27 and 38, stated for the camera position C = -R^T t in the aligned map frame instead of t: the two rays
 of a pair start at their map points, and C is where they come closest. (Eq. 25's H loses rank for horizontal bearings;
 the distance to both rays, H = [I - v_i v_i^T; I - v_j v_j^T], does not, and its least-squares solution is the middle of
-their shortest connection.) With depth bounds S (see ``pair_arcs``) and a true yaw at most delta away, a pair of
+their shortest connection.) With depth bounds S (see ``pair_sinusoids``) and a true yaw at most delta away, a pair of
 inliers has
 
     |C - C_true| <= ||H^+|| hypot(S_i sin eps_i, S_j sin eps_j) + |C'| delta + |C''| delta^2 / 2,
@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.consensus.long_sort import order_of_few
-from spherloc.consensus.pair_arcs import Arcs, BoundedRays, YawInterval, chord, pair_sinusoids
+from spherloc.consensus.pair_arcs import Arcs, BoundedRays, YawInterval
+from spherloc.consensus.pair_sinusoids import chord, pair_sinusoids
 from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.small_arrays import copy_vector, fill_matrix, fill_vector

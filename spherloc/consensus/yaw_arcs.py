@@ -1,11 +1,11 @@
 """Yaw arcs: for every pair of correspondences, the yaws at which both can be inliers; and the yaw that most arcs cover.
 
-**Arcs.** At the true yaw of a pair of inliers, |f| <= tau, S_i >= 0 and S_j >= 0 (see ``pair_arcs``). Each of these is
-A cos yaw + B sin yaw + C >= 0, which is one arc, so the feasible yaws are an intersection of four arcs in closed form:
-usually one short arc around each root of Eq. 22 with positive depths. The arcs bound: the true yaw cannot be
-outside while the noise is within its bound. They are intersected as pairs of unit vectors (cos, sin), from the first
-end counterclockwise to the second, so that angles are computed only of the arcs that are returned: half of all pairs
-have none.
+**Arcs.** At the true yaw of a pair of inliers, |f| <= tau, S_i >= 0 and S_j >= 0 (see ``pair_sinusoids``). Each of
+these is A cos yaw + B sin yaw + C >= 0, which is one arc, so the feasible yaws are an intersection of four arcs in
+closed form: usually one short arc around each root of Eq. 22 with positive depths. The arcs bound: the true yaw
+cannot be outside while the noise is within its bound. They are intersected as pairs of unit vectors (cos, sin), from
+the first end counterclockwise to the second, so that angles are computed only of the arcs that are returned: half of
+all pairs have none.
 
 **The deepest yaw**, covered by most arcs: a maximum clique of the rotation graph (Eq. 34, 37) without building a graph.
 Arcs on a line that overlap pairwise share a point, so a clique of their graph is a point and the arcs over it. On the
@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.consensus.pair_arcs import chord, pair_sinusoids
 from spherloc.consensus.pair_rows import fill_rows
+from spherloc.consensus.pair_sinusoids import ROUNDING, chord, pair_sinusoids
 from spherloc.kernel_cache import kernel
 from spherloc.problem import AlignedProblem
 from spherloc.types import FloatArray, IndexArray
@@ -29,8 +29,6 @@ FULL = 2.0 * np.pi
 """The whole circle, rad."""
 MAX_ARCS = 4
 """Four arcs of a circle intersect in at most four."""
-ROUNDING = 1e-12
-"""Slack of every condition, relative to its amplitude, so that rounding never excludes the true yaw."""
 MIN_SINE = 1e-9
 """Sine of the angle by which the ends of a short arc may be swapped by rounding. No long arc leaves so little open."""
 BINS = 1440

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spherloc.consensus.pair_arcs import chord
+from spherloc.consensus.pair_sinusoids import chord
 from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.geometry import yaw_rotation
 from spherloc.problem import AlignedProblem

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from pair_samples import aligned_problem, sample, unit
 
 from spherloc.consensus import pair_rows
+from spherloc.consensus.arc_block import BLOCK
 from spherloc.consensus.pair_arcs import CIRCLE, direction_of_turn, pair_arcs, turn_of, yaws_between
 from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.watch import Cancelled, Watch
@@ -199,3 +200,19 @@ def test_middle_holds_all_of_the_arc(start, width):
     for yaw in (start, start + width):
         assert abs((yaw - middle + np.pi) % (2 * np.pi) - np.pi) <= half + 2e-15
     assert half == pytest.approx(0.5 * width, abs=1e-11)
+
+
+def test_arcs_of_a_pair_do_not_depend_on_the_other_matches(rng):
+    """Pairs are done in blocks, the last of a row a shorter one."""
+    count = 2 * BLOCK + 9
+    s = sample(rng, 1e-2, count)
+    v, p = s.aligned.bearings, rng.permutation(s.aligned.points)
+    pairs, lo, hi = pair_arcs(aligned_problem(v, p), s.bound_rad)
+    numbers = set()
+    for i, j in [(0, 1), (0, BLOCK), (0, BLOCK + 1), (count - 2, count - 1), *rng.integers(0, count, (200, 2))]:
+        if i < j:
+            _, *ends = pair_arcs(aligned_problem(v[[i, j]], p[[i, j]]), s.bound_rad[[i, j]])
+            mine = (pairs == (i, j)).all(axis=1)
+            np.testing.assert_array_equal([lo[mine], hi[mine]], ends)
+            numbers.add(int(mine.sum()))
+    assert numbers == {0, 1, 2}

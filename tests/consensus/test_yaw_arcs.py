@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pair_samples import aligned_problem, sample, unit
 
-from spherloc.consensus.pair_arcs import chord, pair_sinusoids
+from spherloc.consensus.pair_sinusoids import chord, pair_sinusoids
 from spherloc.consensus.yaw_arcs import yaw_arcs
 from spherloc.geometry import yaw_rotation
 from spherloc.solvers.two_point import two_point
