@@ -72,8 +72,8 @@ def _behind(most_i, most_j, u0, v0, u1, v1):
     """Whether S_i < 0 or S_j < 0 on all of the arc from (``u0``, ``v0``) to (``u1``, ``v1``), unit vectors, if that is
     shorter than half a circle.
 
-    ``most_i`` and ``most_j`` are (cos, sin, constant) of S_i and S_j, m. A sinusoid exceeds the larger of its ends by at
-    most its amplitude times sin^2 of half the arc's width.
+    ``most_i`` and ``most_j`` are (cos, sin, constant) of S_i and S_j, m. A sinusoid exceeds the larger of its ends by
+    at most its amplitude times sin^2 of half the arc's width.
     """
     half = 0.5 * (1.0 - (u0 * u1 + v0 * v1))
     is_short = u0 * v1 - v0 * u1 > 0.0  # the sine of the width
