@@ -153,7 +153,7 @@ def _fill(bearings, points, eps, rows, arcs, board):
 
 @kernel(inline="always")
 def _put(arcs, place, i, j, start, end):
-    """Write an arc of the pair ``i``, ``j`` from the turn ``start`` to the turn ``end``, in [0, 4], to a ``place`` of the
+    """Write an arc of the pair ``i``, ``j`` from the turn ``start`` to ``end``, in [0, 4], to a ``place`` of the
     ``Arcs`` ``arcs``."""
     pairs, lo, hi = arcs
     pairs[place, 0], pairs[place, 1] = i, j
