@@ -1,6 +1,7 @@
 """Errors and scores of Sec. VI."""
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -62,7 +63,17 @@ def ransac_success_probability(inlier_rate: float, sample_size: int, iterations:
 
 
 def evaluate(trace: Trace) -> Metrics:
-    """Score a run with the true pose and labels, as far as they are known."""
+    """Score a run with the true pose and labels, as far as they are known; once for a trace."""
+    known = _EVALUATED.get(trace)
+    if known is None:
+        known = _EVALUATED[trace] = _evaluate(trace)
+    return known
+
+
+_EVALUATED: WeakKeyDictionary[Trace, Metrics] = WeakKeyDictionary()
+
+
+def _evaluate(trace: Trace) -> Metrics:
     problem, estimate = trace.problem, trace.cam_from_map
     rotation = translation = t_error = success = None
     if problem.truth_cam_from_map is not None:

@@ -72,8 +72,7 @@ class Variation:
     @property
     def simulation(self) -> dict[str, Any]:
         """The changed fields of a synthetic scene, with their values."""
-        values = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in EDITS}
-        return {name: value for name, value in values.items() if value is not None}
+        return {name: value for name in _SIMULATED if (value := getattr(self, name)) is not None}
 
     @property
     def edited(self) -> bool:
@@ -180,6 +179,9 @@ class Variation:
     def _remark(self) -> str:
         edits = [f"{len(getattr(self, name))} {name}" for name in EDITS if getattr(self, name)]
         return f"Matches were changed by hand: {', '.join(edits)}."
+
+
+_SIMULATED = tuple(item.name for item in fields(Variation) if item.name not in EDITS)
 
 
 def _changed_name(scene: SyntheticScene, changed: SyntheticScene, fields_changed: Iterable[str]) -> str:

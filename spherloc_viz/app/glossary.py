@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import lru_cache
 from html import escape
 
 from spherloc_viz.app.text import DIM, box
@@ -67,6 +68,7 @@ _FORMS = {form: term for term in TERMS for form in (term, _PLURALS.get(term, f"{
 _WORDS = re.compile(rf"\b({'|'.join(sorted(map(re.escape, _FORMS), key=len, reverse=True))})\b")
 
 
+@lru_cache(maxsize=256)
 def linked(words: str) -> str:
     """Words as HTML, in which every term is marked where it first stands: pressing it tells what it means."""
     seen: set[str] = set()

@@ -27,7 +27,7 @@ from spherloc_viz.app.stage.canvas import Canvas, panel_widths_px, text_scale
 from spherloc_viz.app.stage.subjects import walk_at_end
 from spherloc_viz.app.text import diagnosis_html, hidden_html, key_step_html, status_html, summary_of
 from spherloc_viz.app.web.touch import Touch, Touches, pixels_of
-from spherloc_viz.app.web.viser_internals import changes_of, set_theme
+from spherloc_viz.app.web.viser_internals import changes_of, sent_at_once, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
 from spherloc_viz.layers.key_step import key_step
 from spherloc_viz.layers.outcome import early_table
@@ -172,9 +172,8 @@ class RunDisplay:
     def draw_map(self) -> None:
         """Show the map of what is opened before there is any run."""
         if self._map is not None:
-            with self._client.atomic():
+            with sent_at_once(self._client):
                 self.canvas.draw_map(*self._map)
-            self._client.flush()
 
     def end_opening(self) -> None:
         """The opening has ended without a new run: show the scene before."""
@@ -215,7 +214,7 @@ class RunDisplay:
             with_selection(picture, trace, selected), run, controls.items(known, hidden), last
         )
         self._shown = known, mesh, drawn
-        with self._client.atomic():
+        with sent_at_once(self._client):
             self._follow_theme()
             with changes_of(self._client.gui).as_of(answers):
                 if self._map is not None and self._map[0] != run.request.scene.scene:
@@ -235,7 +234,6 @@ class RunDisplay:
             self.panels.draw(run, plain, pause is not None, outcome, selected, not told, offered, cause)
             self.panels.diagnose("" if hidden else _diagnosed_html(trace, diagnosis, index))
             self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, not told)
-        self._client.flush()
         nearest = sorted(range(len(timeline)), key=lambda other: (abs(other - index), index - other))
         self._to_prepare = deque(
             partial(self._paint_ahead, run, other, selected, told) for other in nearest[1 : 1 + MAX_AHEAD]

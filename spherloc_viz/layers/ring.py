@@ -174,17 +174,20 @@ def peaks(counts: np.ndarray, reach: int, most: int) -> np.ndarray:
     At a peak no count within ``reach`` places is larger, and no other peak is that close. Equal ones come in an order
     that jumps around the circle, so that a few of many do not lie side by side.
     """
-    highest, width = np.pad(counts, reach, mode="wrap"), 1
+    highest, width = np.concatenate([counts[-reach:], counts, counts[:reach]]), 1
     while width <= 2 * reach:  # the highest of ``width`` places in a row, each time of up to twice as many
         step = min(width, 2 * reach + 1 - width)
         highest, width = np.maximum(highest[:-step], highest[step:]), width + step
     candidates = np.flatnonzero((counts == highest) & (counts > 0))
     candidates = candidates[np.lexsort((candidates * GOLDEN % 1.0, -counts[candidates]))]
     found: list[int] = []
-    while len(candidates) and len(found) < most:
-        found.append(int(candidates[0]))
-        gaps = np.abs(candidates - candidates[0])
-        candidates = candidates[np.minimum(gaps, len(counts) - gaps) > reach]
+    near: set[int] = set()
+    for place in candidates.tolist():
+        if len(found) == most:
+            break
+        if place not in near:
+            found.append(place)
+            near.update(other % len(counts) for other in range(place - reach, place + reach + 1))
     return np.array(found, dtype=np.int64)
 
 

@@ -179,6 +179,29 @@ def _changed(known: Any, props: dict[str, Any]) -> dict[str, Any]:
     return updates
 
 
+@contextlib.contextmanager
+def sent_at_once(client: viser.ClientHandle) -> Iterator[None]:
+    """While open, messages to a client are collected; then they are sent together, at once.
+
+    ``atomic`` and then ``flush`` do the same, but wake viser's thread twice, the first time to wait; each time the
+    thread that draws waits for the interpreter's lock.
+    """
+    buffer = client._websock_connection.get_message_buffer()
+    buffer.atomic_start()
+    try:
+        yield
+    finally:
+        with buffer.buffer_lock:
+            buffer.atomic_counter -= 1
+
+        def wake() -> None:
+            buffer.message_event.set()
+            buffer.flush_event.set()
+
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            buffer.event_loop.call_soon_threadsafe(wake)
+
+
 def place_viewer(client: viser.ClientHandle, position: FloatArray, target: FloatArray) -> None:
     """Put a client's viewer at a position (3,), where it looks at another place, the target (3,).
 
