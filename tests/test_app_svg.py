@@ -195,6 +195,13 @@ def test_charts_of_nothing_can_be_drawn(curves: tuple[Curve, ...]) -> None:
     assert parsed(chart_svg(chart(*curves))).tag == f"{SVG}svg"
 
 
+def test_equal_curves_can_both_be_seen() -> None:
+    x, y = np.arange(5.0), np.ones(5)
+    paths = parsed(chart_svg(chart(curve(x, y), curve(x, y)))).findall(f".//{SVG}path")
+    lines = [float(path.attrib["stroke-width"]) for path in paths if path.attrib["d"].count("L") == 4]
+    assert len(lines) == 2 and lines[0] > lines[1] > 1.5
+
+
 def test_every_text_is_escaped() -> None:
     evil = Chart(EVIL, EVIL, EVIL, EVIL, (Curve(EVIL, np.arange(3.0), np.arange(3.0), style.TRUTH),) * 2)
     html = chart_html(evil)

@@ -21,7 +21,7 @@ from spherloc_viz.layers.frame import RunView
 from spherloc_viz.layers.outcome import early_table
 from spherloc_viz.layers.primitives import Balls, Label, Picture, Points, SceneItem, Segments, true_minus
 from spherloc_viz.layers.ransac import MAX_IMPROVEMENTS
-from spherloc_viz.layers.yaw import StageArcs
+from spherloc_viz.layers.stage_arcs import StageArcs
 
 
 @pytest.fixture(scope="module")

@@ -223,6 +223,9 @@ def _graph(view: RunView, nodes: Callable[[], Nodes], marked: np.ndarray, words:
 def _clique(view: RunView, stage: ConsensusStage) -> Frame:
     size, most = len(stage.clique), highest_bound(stage)
     pairs, note = _pairs(stage.clique)
+    inliers = int(np.count_nonzero(view.trace.inlier_mask))
+    if inliers not in (0, size):
+        note += f" The refinement may tilt the camera too, and ends with {inliers} inliers."
     return Frame(
         _agreement(view, stage),
         f"{size} ≤ max over θ of ω(G(θ)) ≤ {most}",

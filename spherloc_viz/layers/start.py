@@ -39,7 +39,7 @@ def _problem(view: RunView) -> Frame:
     if problem.truth_inliers is not None:
         wrong = count - int(np.count_nonzero(problem.truth_inliers))
         how = "by construction" if problem.image is None else "by the true pose"
-        known = f", {wrong} of them wrong {how}" if wrong else f", all of them right {how}"
+        known = f", {wrong} of them wrong {how} (red)" if wrong else f", all of them right {how}"
     return Frame(
         f"{count} pixels are matched to map points{known}; each line ties a bearing to its point. "
         f"Nothing is known about yaw or position yet, so the camera stands in the middle of the map.",
@@ -118,7 +118,9 @@ def _gravity(view: RunView) -> Frame:
     lean = np.degrees(np.arctan2(np.hypot(*problem.gravity_camera[[0, 2]]), problem.gravity_camera[1]))
     bound = problem.gravity_bound_rad
     source = f" from {problem.gravity_source}" if problem.gravity_source else ""
-    known = f"{source} exactly" if bound == 0.0 else f"{source} to within {np.degrees(bound):.2g}°"
+    known = (
+        f"{source} exactly" if bound == 0.0 else f"{source} to within {np.degrees(bound):.2g}°{_deviations(problem)}"
+    )
     return Frame(
         f"Gravity is known{known} in the camera, where it points {lean:.1f}° away from the image's down, and in the "
         "map. Both frames are turned until it points straight down, which settles roll and pitch.",
@@ -128,6 +130,15 @@ def _gravity(view: RunView) -> Frame:
         view.no_matches(),
         items=_upright(view),
     )
+
+
+def _deviations(problem: Problem) -> str:
+    """How many standard deviations of gravity the bound on its error is, as part of a sentence; empty if that is
+    unknown."""
+    sd_rad = problem.gravity_sd_rad
+    if not sd_rad or not np.isfinite(sd_rad):
+        return ""
+    return f" ({problem.gravity_bound_rad / sd_rad:.2g} standard deviations of {np.degrees(sd_rad):.2g}°)"
 
 
 def _upright(view: RunView) -> tuple[SceneItem, ...]:

@@ -6,10 +6,11 @@ from functools import cache, partial
 
 import numpy as np
 
-from spherloc.geometry import camera_centre
+from spherloc.geometry import camera_centre, yaw_of
 from spherloc.trace import TranslationStage
 from spherloc.types import FloatArray, IntArray
 from spherloc_viz import style
+from spherloc_viz.layers import ring
 from spherloc_viz.layers.ball_set import BallSet
 from spherloc_viz.layers.frame import Frame, Plan, RunView, growing, one_color, sphere_box
 from spherloc_viz.layers.graph_nodes import ball_nodes, ball_rows, graph_at
@@ -241,12 +242,18 @@ def _clique(view: RunView, balls: BallSet) -> Frame:
         start,
         view.colors(style.UNDECIDED, (members, style.CLIQUE)),
         view.no_matches(),
-        note=f"{_note(balls, balls.by_radius, balls.in_clique)}{lost}".strip(),
+        note=f"{_own_yaw(view, start)} {_note(balls, balls.by_radius, balls.in_clique)}{lost}".strip(),
         located=True,
         sphere_aside=True,
         items=(*balls.items(view, balls.by_radius, balls.in_clique), _clique_name(balls)),
         focus=balls.focus(balls.by_radius, balls.in_clique),
     )
+
+
+def _own_yaw(view: RunView, cam_from_map: FloatArray) -> str:
+    """A sentence on the yaw of the pose (3, 4) of a pair."""
+    yaw_rad = float(yaw_of(cam_from_map[:, :3]))
+    return f"That pair fixes the yaw anew, at {np.degrees(yaw_rad):.2f}°{ring.off_truth(view, yaw_rad)}."
 
 
 def _clique_name(balls: BallSet) -> Label:

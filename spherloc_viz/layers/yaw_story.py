@@ -14,7 +14,8 @@ from spherloc_viz import style
 from spherloc_viz.layers import ring
 from spherloc_viz.layers.frame import RunView
 from spherloc_viz.layers.primitives import Chart, Curve
-from spherloc_viz.layers.yaw import CANDIDATE, StageArcs, chosen_arcs
+from spherloc_viz.layers.stage_arcs import StageArcs
+from spherloc_viz.layers.yaw import CANDIDATE, chosen_arcs
 
 Window = tuple[float, float]
 """Yaws from the first, in [-180, 180) degrees, to the second, which exceeds 180 where the window crosses the seam."""

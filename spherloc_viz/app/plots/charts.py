@@ -123,9 +123,11 @@ def legend_parts(y_label: str, rows: list[list[tuple[Curve, float]]], width_px: 
 
 
 def curve_parts(curves: tuple[Curve, ...], x: Scale, y: Scale, bands: Bands | None = None) -> list[str]:
-    """The curves within the x axis: bands below, then lines, then markers. The first marker is broad, later ones are
-    thin and dashed, so that both are seen where they coincide."""
+    """The curves within the x axis: bands below, then lines, then markers. Of several, the first are broad and later
+    ones thin, so that all are seen where they coincide; later markers are dashed too."""
     bands = bands or {}
+    under = sum(curve.kind == "line" and len(curve.x) > 0 for curve in curves)
+    step_px = min(1.25, 5.0 / max(1, under - 1))
     parts = [_band(curve, x, y, *bands[curve.label]) for curve in curves if curve.label in bands]
     marked = False
     for curve in curves:
@@ -142,7 +144,8 @@ def curve_parts(curves: tuple[Curve, ...], x: Scale, y: Scale, bands: Bands | No
         elif curve.kind == "step":
             parts += step_parts(curve, x, y)
         else:
-            parts += _line(curve, x, y)
+            under -= 1
+            parts += _line(curve, x, y, under * step_px)
     return parts
 
 
@@ -187,18 +190,21 @@ def _clipped(x: Scale, xs: FloatArray, *values: FloatArray) -> tuple[FloatArray,
     return cut, *(np.interp(cut, xs, value) for value in values)
 
 
-def _line(curve: Curve, x: Scale, y: Scale) -> list[str]:
+def _line(curve: Curve, x: Scale, y: Scale, wider_px: float) -> list[str]:
+    """A line with dots at its points, ``wider_px`` broader than a single one."""
     known = _known(curve, curve.y)
     xs, ys = _clipped(x, *known)
     xs, ys = shapes.thin(xs, ys)
     if len(xs) == 0:
         return []
-    parts = [f'<path d="{shapes.corners(x.px(xs), y.px(ys))}" {shapes.stroke(curve.color, 1.75)}/>']
+    parts = [f'<path d="{shapes.corners(x.px(xs), y.px(ys))}" {shapes.stroke(curve.color, 1.75 + wider_px)}/>']
     if len(known[0]) <= MAX_DOTS:
+        radius = shapes.number(2.5 + 0.5 * wider_px)
         inside = (known[0] >= x.low) & (known[0] <= x.high)
         for left, top in zip(x.px(known[0][inside]).tolist(), y.px(known[1][inside]).tolist(), strict=True):
             parts.append(
-                f'<circle cx="{shapes.number(left)}" cy="{shapes.number(top)}" r="2.5" {shapes.fill(curve.color)}/>'
+                f'<circle cx="{shapes.number(left)}" cy="{shapes.number(top)}" r="{radius}" '
+                f"{shapes.fill(curve.color)}/>"
             )
     return parts
 
@@ -246,8 +252,9 @@ MAX_DECADES, MAX_TICKS = 5, 6
 TABLE_PX = 260
 IN_TABLE = ("success", "position error", "time")
 NOTE = (
-    "Bands: the success's 95 % Wilson interval, and the quartiles of all runs' errors and times. A run without a pose "
-    "has an infinite error. Times are of workers side by side, beside this page."
+    "Curves: the success, and the medians of all runs' errors and times. Bands: the success's 95 % Wilson interval, "
+    "and the quartiles. A run without a pose has an infinite error. Times are of workers side by side, beside this "
+    "page."
 )
 
 
