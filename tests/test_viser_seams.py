@@ -2,13 +2,20 @@
 
 import sys
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
 import viser
 from viser import _messages
 
-from spherloc_viz.app.web.viser_internals import at_once, guard_callbacks, start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import (
+    at_once,
+    guard_callbacks,
+    sent_at_once,
+    start_viser,
+    stop_viser,
+)
 from tests.connected_page import HELLO, ConnectedPage
 from tests.waiting import until
 
@@ -80,6 +87,24 @@ def test_nobody_is_woken_on_a_thread_of_ours(server: viser.ViserServer, pages: l
         until(lambda event=event: len(event._waiters) > 0 and not event.is_set())
         event.set()
         assert not event.is_set()
+
+
+def test_what_is_sent_at_once_comes_together_even_if_the_drawing_fails(pages: list[ConnectedPage]) -> None:
+    """Nothing is sent before the end, and nothing is left waiting for a message that comes later."""
+    page = pages[0]
+    heard: list[str] = []
+    page.answer = lambda message: heard.append(message.get("uuid", ""))
+    buffer = page.handle._websock_connection.get_message_buffer()
+    with pytest.raises(ZeroDivisionError), sent_at_once(page.handle):
+        for name in ("first", "second"):
+            page.handle._websock_connection.queue_message(_messages.GuiUpdateMessage(name, {"value": 1}))
+        buffer.flush()
+        time.sleep(0.2)
+        assert "first" not in heard
+        raise ZeroDivisionError
+    until(lambda: "second" in heard)
+    assert [name for name in heard if name in ("first", "second")] == ["first", "second"]
+    assert buffer.atomic_counter == 0
 
 
 def test_what_is_to_be_done_at_once_is_done_on_the_loop_in_order_and_its_failures_are_told(
