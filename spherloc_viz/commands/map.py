@@ -184,10 +184,11 @@ def _write(
     report: Path, made: Map, found: Photographs, measured: ScaleMeasurement, given: Mapping[str, Camera]
 ) -> None:
     """Write the report of a map, and beside it the calibrations that its images told or that were ``given`` and what
-    gave its scale; raises ``OSError``."""
+    gave its scale, if anything did; raises ``OSError``."""
     report.write_text(map_report(made, found), encoding="utf-8")
     write_lenses(report.parent, found.calibrated or (lenses_given(found.views) if given else {}))
-    keep_scale(report.parent, measured)
+    if any(one.scale.source for one in (made, *made.groups)):
+        keep_scale(report.parent, measured)
 
 
 def _of_the_map_before(folder: Path, made: Map) -> list[str]:
