@@ -404,11 +404,20 @@ class ResultsLog:
         kept = {name: row for name, row in self.rows.items() if name not in queries}
         removed = len(self.rows) - len(kept)
         if removed:
-            content = "".join(f"{json_line(row)}\n" for row in kept.values())
-            self.write(ROWS, content.encode())
-            self.rows = kept
-            self._write_table()
+            self._rewrite(kept)
         return removed
+
+    def change(self, rows: Iterable[QueryResult]) -> None:
+        """Put these rows in the place of those of the same queries.
+
+        Raises ``InputError`` if the files cannot be written.
+        """
+        self._rewrite(self.rows | {row.query: row for row in rows})
+
+    def _rewrite(self, rows: dict[str, QueryResult]) -> None:
+        self.write(ROWS, "".join(f"{json_line(row)}\n" for row in rows.values()).encode())
+        self.rows = rows
+        self._write_table()
 
     def results(self) -> SequenceResults:
         """The results so far, in the order of the sequence; they are also written to ``results.csv``."""

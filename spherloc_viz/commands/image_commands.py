@@ -338,7 +338,7 @@ def map(
         gravity=None if gravity is None else (gravity, turn),
         features=features,
     )
-    code = max([0 if made.whole else 1, *(_localize_by_default(scene) for scene in made.new_scenes)])
+    code = max(0 if made.whole else 1, _localize_by_default(made.new_scenes))
     scene = next(iter(made.new_scenes), made.scene)
     if play:
         _play(scene)
@@ -347,9 +347,20 @@ def map(
     return code
 
 
-def _localize_by_default(scene: Path) -> int:
-    """``localize`` with all options left out, where that name is taken."""
-    return localize((scene,))
+def _localize_by_default(scenes: Sequence[Path]) -> int:
+    """Localize the same photographs in the maps of these scene files, as ``localize`` without options does in one."""
+    from spherloc_viz.commands.localize import Solving, localize_in_maps
+    from spherloc_viz.commands.run import Records
+
+    folders = {scene: RECORDINGS / f"{_results_name(scene)}_auto_0" for scene in scenes}
+    solvings = {
+        scene: Solving("auto", (), folder, Records(folder / "recordings", keep_gigabytes=None), numbered=True)
+        for scene, folder in folders.items()
+    }
+    try:
+        return localize_in_maps(solvings)
+    except KeyboardInterrupt:
+        os._exit(INTERRUPTED)  # as in ``localize``
 
 
 def _play(scene: Path) -> None:

@@ -24,6 +24,7 @@ from spherloc.experiments.results import (
     folder_for,
 )
 from spherloc.experiments.sequence import How, chosen_queries, has_changed, localize_by_each
+from spherloc.experiments.several_maps import outdone
 from spherloc.experiments.summary import (
     estimated_trajectory,
     summarize,
@@ -93,6 +94,27 @@ def localize_sequence(
     for found in done.results:
         print(sequence_text(found, summarize(found), done.scene), flush=True)
     return _code(done)
+
+
+def localize_in_maps(solvings: Mapping[Path, Solving]) -> int:
+    """Localize the same photographs in several maps, each scene file with its solving, and doubt a pose where another
+    map explains more of a photograph's matches; returns the exit code.
+
+    0 if every photograph is localized in one of the maps. Raises ``InputError`` as ``localize_sequence`` does.
+    """
+    done = {path: localized(path, [solving], 0, (), False) for path, solving in solvings.items()}
+    changed = outdone([one.results[0] for one in done.values()])
+    for one, rows in zip(done.values(), changed, strict=True):
+        found = one.results[0]
+        if rows:
+            with ResultsLog(found.folder, found.configuration) as log:
+                log.change(rows)
+                found = log.results()
+                _finish(log, found, one.scene, one.backdrop)
+            one.results[0] = found
+        print(sequence_text(found, summarize(found), one.scene), flush=True)
+    sure = {row.query for one in done.values() for row in one.results[0].rows if row.status == LOCALIZED}
+    return 0 if all(one.chosen <= sure for one in done.values()) else 1
 
 
 def compare_sequences(

@@ -26,7 +26,7 @@ STANDING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 GRAVITY_MAP = np.array([0.0, 0.0, -1.0])
 
 KEYS = {"kind", "name"}
-OPTIONAL = {"queries", "broken", "few", "unknown", "wrong", "stuck", "registered", "timed", "folder"}
+OPTIONAL = {"queries", "broken", "few", "thin", "unknown", "wrong", "stuck", "registered", "timed", "folder"}
 
 
 def true_pose(place: int) -> np.ndarray:
@@ -38,13 +38,14 @@ def true_pose(place: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class DrawnMatches:
-    """Draws the matches of a query; ``few`` queries get a single one, ``wrong`` ones only wrong ones.
+    """Draws the matches of a query: 60, 24 for ``thin`` queries, a single one for ``few``, wrong ones for ``wrong``.
 
     ``stuck`` ones wait until there is a file "go on" beside the images.
     """
 
     references: tuple[View, ...]
     few: tuple[int, ...]
+    thin: tuple[int, ...]
     wrong: tuple[int, ...]
     stuck: tuple[int, ...]
 
@@ -55,7 +56,8 @@ class DrawnMatches:
             time.sleep(0.01)
         rng = np.random.default_rng(place)
         truth = true_pose(place)
-        points = rng.uniform(-20.0, 20.0, (1 if place in self.few else 60, 3)) - truth[:, :3].T @ truth[:, 3]
+        count = 1 if place in self.few else 24 if place in self.thin else 60
+        points = rng.uniform(-20.0, 20.0, (count, 3)) - truth[:, :3].T @ truth[:, 3]
         pixels, _ = CAMERA.project(transform(truth, points))
         pixels = np.clip(pixels + NOISE_PX * rng.standard_normal(pixels.shape), 0.01, [1023.99, 511.99])
         false = np.arange(len(points)) % 3 == 0 if place not in self.wrong else np.ones(len(points), dtype=bool)
@@ -97,13 +99,13 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
         stamp = 1520530308.25 + 0.1 * place if table.get("timed", False) else None
         queries.append(View(image.name, CAMERA, image, known, Gravity(STANDING @ GRAVITY_MAP, "the IMU"), stamp))
     reference = View("reference", CAMERA, folder / "image0.png", true_pose(0))
-    few, wrong = tuple(table.get("few", ())), tuple(table.get("wrong", ()))
+    few, thin, wrong = (tuple(table.get(name, ())) for name in ("few", "thin", "wrong"))
     return MapScene(
         name=table["name"],
         where=str(path),
         queries=tuple(queries),
         references=(reference,),
-        matcher=DrawnMatches((reference,), few, wrong, tuple(table.get("stuck", ()))),
+        matcher=DrawnMatches((reference,), few, thin, wrong, tuple(table.get("stuck", ()))),
         gravity_map=GRAVITY_MAP,
         thresholds=((0.5, 0.1), (2.0, 0.5)),
         registration=DistanceRegistration() if table.get("registered", False) else None,

@@ -34,7 +34,7 @@ from spherloc.trajectory import read_tum
 from spherloc.warm_up import warm_up
 from spherloc_viz.commands.bundled import all_scenes, one_kind
 from spherloc_viz.commands.image_commands import _results_name
-from spherloc_viz.commands.localize import Solving, compare_sequences, localize_sequence
+from spherloc_viz.commands.localize import Solving, compare_sequences, localize_in_maps, localize_sequence
 from spherloc_viz.commands.run import Records
 from spherloc_viz.plots.trajectories import backdrop_of, trajectory_png
 from spherloc_viz.recording.content.data import read_recording
@@ -313,6 +313,28 @@ def test_results_of_two_maps_do_not_meet(tmp_path: Path) -> None:
         "cellar_map_group_2_new",
     ]
     assert _results_name(tmp_path / "street.toml") == "street"
+
+
+@pytest.mark.usefixtures("drawn")
+def test_a_place_is_doubted_where_another_map_explains_more(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    solvings = {}
+    for folder, kind in ((first, {"wrong": [2]}), (second, {"thin": [1, 2]})):
+        folder.mkdir()
+        solvings[write_scene(folder, queries=3, **kind)] = Solving("auto", (), folder / "out", None)
+    for _ in range(2):  # what is done already is compared too
+        assert localize_in_maps(solvings) == 0
+        assert [row["status"] for row in table(first / "out")] == ["localized", "localized", "doubtful"]
+        told = table(second / "out")
+        assert [row["status"] for row in told] == ["localized", "doubtful", "localized"]
+        assert told[1]["remarks"] == (
+            f"More of its matches agree with a pose in the map of {first / 'scene.toml'}; it may have been taken there."
+        )
+        summary = json.loads((second / "out" / "summary.json").read_text())
+        assert (summary["localized"], summary["doubtful"]) == (2, 1)
+        assert f"image1.png: {told[1]['remarks'][:-1]}" in capsys.readouterr().out
+    write_scene(second, queries=3, wrong=[2])
+    assert localize_in_maps({**solvings, second / "scene.toml": Solving("auto", (), tmp_path / "new", None)}) == 1
 
 
 def pixels_of(png: bytes) -> np.ndarray:
