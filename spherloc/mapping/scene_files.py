@@ -15,7 +15,8 @@ from spherloc.errors import InputError, SpherlocError
 from spherloc.files import is_file, is_folder
 from spherloc.frontend.view import View
 from spherloc.mapping.advice import advice
-from spherloc.mapping.photographs import CalibratedLens, NewImages, cameras_of
+from spherloc.mapping.new_images import NewImages
+from spherloc.mapping.photographs import CalibratedLens, cameras_of
 
 MODEL = "model"
 """Folder of COLMAP's model in that of the map."""

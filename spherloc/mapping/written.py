@@ -12,7 +12,7 @@ from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.model import Reconstruction
-from spherloc.mapping.photographs import NewImages
+from spherloc.mapping.new_images import NewImages
 from spherloc.mapping.scene_files import (
     MODEL,
     SCENE,
