@@ -5,8 +5,9 @@ from pathlib import Path
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.datasets.given_path import ARCHIVES, what_it_is
 from spherloc.errors import InputError
-from spherloc.files import is_folder, is_image, names_in
+from spherloc.files import is_file, is_folder, is_image, names_in
 from spherloc.frontend.view import View
 from spherloc.images import read_size
 from spherloc.mapping.photographs import Photographs, cameras_of, with_cameras
@@ -28,6 +29,8 @@ def new_images_of(folder: Path, mapped: Photographs, panorama: bool = False) -> 
     of the map that has their size, which ``with_cameras`` tells by their names where it has several; others of 2 to 1
     are panoramas. Raises ``InputError`` if there is no image, or none whose camera is known.
     """
+    if is_file(folder) and folder.suffix.lower() in ARCHIVES:
+        raise InputError(what_it_is(folder))
     if not is_folder(folder):
         raise InputError(f"{folder}: is not a folder; give one with images that are to be localized.")
     different = cameras_of(mapped.views)

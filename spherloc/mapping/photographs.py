@@ -12,7 +12,7 @@ import numpy as np
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.datasets.given_path import SCENE, images_in_folders, what_it_is
+from spherloc.datasets.given_path import SCENE, images_below, images_in_folders, what_it_is
 from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in, write_whole
 from spherloc.frontend.masks import Masks
@@ -112,7 +112,7 @@ def with_cameras(
     Raises ``InputError`` if the folder has no photographs, if their camera is unknown, or if it has no model in COLMAP.
     """
     if not is_folder(folder):
-        raise InputError(what_it_is(folder) or f"{folder}: is not a folder; give the folder of the photographs.")
+        raise InputError(_known(folder) or f"{folder}: is not a folder; give the folder of the photographs.")
     there = names_in(folder)
     inside = images_in_folders(folder, [name for name in there if not is_image(name)])
     views: list[View] = []
@@ -143,6 +143,7 @@ def with_cameras(
             if len(cameras_of(found)) == 1:
                 known[name] = found[0].camera
             remarks += [f"{shorten(name)}: {remark}" for remark in about]
+        remarks += _about_deeper(folder, [name for name in there if name not in inside])
     return Photographs(tuple(views), tuple(remarks), known, calibrated)
 
 
@@ -375,16 +376,33 @@ def _about_subfolders(inside: Mapping[str, int]) -> list[str]:
     return [f"{left}; put each camera's images into a folder of its own to have them too."]
 
 
+def _about_deeper(root: Path, names: Sequence[str]) -> list[str]:
+    """A remark on images that are two folders deep or more."""
+    found = [deeper for name in names if is_folder(root / name) and (deeper := images_below(root / name))]
+    if not found:
+        return []
+    where, count = found[0]
+    return [f"{_were(count, 'image')} left out, deeper in the folder, in {where}; give that folder to have them."]
+
+
+def _known(path: Path) -> str:
+    """What a path is and what takes it, if it is known and no scene file is asked for instead; else empty."""
+    told = what_it_is(path)
+    return "" if SCENE in told else told
+
+
 def _without_photographs(folder: Path, remarks: Sequence[str], new: bool) -> str:
     """Why a folder has nothing to map or, if its images are ``new``, to localize, and what to do."""
     if remarks:
         return f"{folder}: has no photographs that can be read. {' '.join(remarks)}"
     if new:
+        deeper = images_below(folder)
+        if deeper:
+            return f"{folder}: has no images, but {deeper[1]} deeper in it, in {deeper[0]}; give that folder."
         return f"{folder}: has no images; give a folder with images that are to be localized."
-    known = what_it_is(folder)
-    if known and SCENE not in known:
-        return known
-    return f"{folder}: has no photographs ({', '.join(sorted(IMAGES))}); give the folder that has them."
+    return (
+        _known(folder) or f"{folder}: has no photographs ({', '.join(sorted(IMAGES))}); give the folder that has them."
+    )
 
 
 def _counted(count: int, what: str) -> str:

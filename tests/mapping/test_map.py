@@ -982,6 +982,32 @@ def test_new_images_of_other_cameras_than_the_map(tmp_path, rng):
     assert remarks == ("The calibration found beside them: calibration.",)
 
 
+def test_photographs_deeper_in_a_folder_are_named(tmp_path, rng):
+    """The folder that has them, for a map and to be localized."""
+    day = tmp_path / "trip" / "day 1" / "left"
+    day.mkdir(parents=True)
+    for name in ("1.png", "2.png"):
+        picture(day / name, 400, 200, rng)
+    with pytest.raises(InputError) as caught:
+        photographs(tmp_path, {})
+    said = f"{tmp_path}: is a folder without images, but with 2 deeper in it, in {day}; make a map of these with: "
+    assert str(caught.value) == f"{said}spherloc map '{day}'"
+    mapped = Photographs((View("m.png", Equirectangular(400, 200), tmp_path / "m.png"),), (), {})
+    with pytest.raises(InputError, match=r"has no images, but 2 deeper in it, in .*left; give that folder\.$"):
+        new_images_of(tmp_path, mapped)
+    (tmp_path / "around").mkdir()
+    for name in ("1.png", "2.png"):
+        picture(tmp_path / "around" / name, 400, 200, rng)
+    found = photographs(tmp_path, {})
+    assert [view.name for view in found.views] == ["around/1.png", "around/2.png"]
+    left_out = f"2 images were left out, deeper in the folder, in {day}; give that folder to have them."
+    assert found.remarks == (left_out,) and new_images_of(tmp_path, mapped)[1] == (left_out,)
+    (tmp_path / "new.zip").write_bytes(b"PK")
+    for ask in (lambda path: photographs(path, {}), lambda path: new_images_of(path, mapped)):
+        with pytest.raises(InputError, match=r"new\.zip: is an archive; unpack it"):
+            ask(tmp_path / "new.zip")
+
+
 def test_new_panoramas_are_told_from_raw_circles(tmp_path, rng):
     """Those of the map's size are its camera's; others of 2 to 1 may be two fisheye circles."""
     picture(tmp_path / "a.png", 400, 200, rng)
