@@ -12,7 +12,7 @@ from spherloc.formats.colmap_files import read_model
 from spherloc.frontend.view import View
 from spherloc.mapping.new_images import new_images_of
 from spherloc.mapping.photographs import Photographs, cameras_of, with_cameras
-from spherloc.mapping.scene_files import MODEL, UNITS_UNKNOWN, MapHead, toml_value, write_new_scene
+from spherloc.mapping.scene_files import MODEL, UNITS_METRES, UNITS_UNKNOWN, MapHead, toml_value, write_new_scene
 
 SECTIONS = ("gravity", "frontend", "masks")
 """Sections of a scene file that are the same for all queries of a map."""
@@ -52,7 +52,7 @@ def add_new_images(scene: Path, folder: Path) -> tuple[Path, tuple[str, ...]]:
         name=_name(table),
         about=str(table.get("about", "")),
         images=own["images"],
-        units=(UNITS_UNKNOWN,) if table.get("units") == "unknown" else (),
+        units=UNITS_UNKNOWN if table.get("units") == "unknown" else UNITS_METRES,
         sections=tuple(line for name in SECTIONS for line in _section(table, name, str(scene))),
     )
     try:

@@ -38,7 +38,16 @@ from spherloc.mapping.misplaced import without_misplaced
 from spherloc.mapping.new_images import NewImages, new_images_of
 from spherloc.mapping.new_queries import add_new_images, map_images
 from spherloc.mapping.photographs import Photographs, _is_in, frames_of, photographs, two_circles
-from spherloc.mapping.scene_files import MODEL, SCENE, MapHead, _camera, _queries, check_images_of, write_new_scene
+from spherloc.mapping.scene_files import (
+    MODEL,
+    SCENE,
+    UNITS_UNKNOWN,
+    MapHead,
+    _camera,
+    _queries,
+    check_images_of,
+    write_new_scene,
+)
 from spherloc.mapping.stated_gravity import read_stated_gravity
 from spherloc.mapping.upright import Level, level_of, scale_by_height, upright_frame
 from spherloc.mapping.written import _gravity
@@ -894,7 +903,7 @@ def test_new_images_of_cameras_that_were_given(tmp_path, rng):
 @pytest.mark.parametrize("name", ["scene", "lens", "lens_front"])
 def test_a_scene_of_new_images_is_not_called_as_another_file_of_the_map(tmp_path, name):
     images = NewImages(tmp_path / name, None)
-    path = write_new_scene(MapHead("m", "", "..", (), ()), tmp_path, images, Equirectangular(64, 32))
+    path = write_new_scene(MapHead("m", "", "..", UNITS_UNKNOWN, ()), tmp_path, images, Equirectangular(64, 32))
     assert path.name == f"new_{name}.toml"
 
 
