@@ -24,6 +24,7 @@ from spherloc.cameras.mei import Mei
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.query_gravity import read_gravity
 from spherloc.errors import CalibrationError, InputError
+from spherloc.estimators import estimate
 from spherloc.formats.colmap_files import read_model
 from spherloc.frontend import trained
 from spherloc.frontend.masks import Masks
@@ -95,6 +96,15 @@ def walk(tmp_path_factory):
         return make_map(MapRequest(found.views, folder, measured, new, masks), output, lambda *what: told.append(what))
 
     return poses, found, again(), again, told, output
+
+
+def cut_out(panorama, camera, panorama_from_camera):
+    """The image (H, W) or (H, W, 3) that another camera takes where a panorama was taken."""
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    bearings, seen = camera.unproject(np.column_stack([columns.ravel(), rows.ravel()]))
+    places, _ = panorama.camera.project(bearings @ panorama_from_camera.T)
+    u, v = np.where(seen[:, None], places - 0.5, -1.0).astype(np.float32).T.reshape(2, camera.height, -1)
+    return cv2.remap(panorama.read(), u, v, cv2.INTER_LINEAR)
 
 
 def test_a_map_has_the_poses_of_the_photographs(walk):
@@ -261,6 +271,24 @@ def test_images_are_added_to_a_map_that_is_made(walk, tmp_path):
     assert [view.name for view in new.queries] == ["a.png"] and new.name == f"some in {images.name}"
     with pytest.raises(InputError, match=r"campus_panorama\.toml: is not the scene of a map"):
         add_new_images(bundled_scenes()["campus_panorama"], some)
+
+
+def test_a_fisheye_is_localized_in_a_map_of_panoramas(walk, tmp_path):
+    """Cut out of a panorama of the map, so that its pose there is known; its calibration lies beside it."""
+    _, found, made, _, _, _ = walk
+    lens = KannalaBrandt(500, 400, 150.0, 150.0, 250.0, 200.0, (0.01, 0.0, 0.0, 0.0))
+    view, turn = found.views[1], so3_exp(np.array([0.1, 0.8, 0.0]))
+    cv2.imwrite(str(tmp_path / "a.png"), cut_out(view, lens, turn))
+    (tmp_path / "lens.toml").write_text("\n".join(["[camera]", *_camera(lens)]))
+    path, _ = add_new_images(made.written.scene, tmp_path)
+    try:
+        scene = load_scene(path)
+        pose = estimate(scene.problem(), "auto").cam_from_map
+    finally:
+        path.unlink()
+    expected = turn.T @ made.written.poses[view.name]
+    assert rotation_angle(pose[:, :3] @ expected[:, :3].T) < np.radians(0.3)
+    assert np.linalg.norm(camera_centre(pose) - camera_centre(expected)) < 0.05
 
 
 def test_what_is_done_is_not_done_again(walk):
@@ -445,12 +473,8 @@ def rig(walk, tmp_path_factory):
         (folder / name).mkdir()
         (folder / f"{name}.toml").write_text(written(camera))
         panorama_from_camera = so3_exp(np.array([0.0, turn_rad, 0.0]))
-        columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        bearings, seen = camera.unproject(np.column_stack([columns.ravel(), rows.ravel()]))
         for view in panoramas.views:
-            places, _ = view.camera.project(bearings @ panorama_from_camera.T)
-            u, v = np.where(seen[:, None], places - 0.5, -1.0).astype(np.float32).T.reshape(2, camera.height, -1)
-            cv2.imwrite(str(folder / name / view.name), cv2.remap(view.read(), u, v, cv2.INTER_LINEAR))
+            cv2.imwrite(str(folder / name / view.name), cut_out(view, camera, panorama_from_camera))
             cut[f"{name}/{view.name}"] = panorama_from_camera.T @ poses[view.name]
     return folder, cut
 
