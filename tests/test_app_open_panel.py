@@ -189,7 +189,7 @@ def test_photographs_are_localized_in_the_map_at_hand(visitor: Visitor, folder: 
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), np.zeros((320, 640), np.uint8))
     written = write(folder / "home_map" / "model", binary_files(sample_model(rng, models=(EQUIRECTANGULAR,))))
-    head = MapHead("home (units unknown)", "A map.", "../home", (UNITS_UNKNOWN,), ("", "[gravity]", "map = [0, 0, -1]"))
+    head = MapHead("home (units unknown)", "A map.", "../home", UNITS_UNKNOWN, ("", "[gravity]", "map = [0, 0, -1]"))
     (written.parent / "scene.toml").write_text(scene_text(head, own))
 
     visitor.touch("open-folder:0:0:later")

@@ -50,6 +50,27 @@ def _sfm_lift(lift: ObservedLift) -> SfmLift:
     return SfmLift(*lift.image.observed(lift.model))
 
 
+def read_map(folder: Path) -> ColmapModel:
+    """The model in ``folder`` as a map; raises ``InputError`` as ``read_model`` does, and if it has no points."""
+    model = read_model(folder)
+    if len(model.points.ids) == 0:
+        raise InputError(
+            f"{folder}: the COLMAP model has no points, by whose matches a query is localized; make them with colmap "
+            "point_triangulator, or give another model."
+        )
+    return model
+
+
+def assumed_units(table: Mapping[str, Any]) -> list[str]:
+    """A remark where a scene file does not say whether the lengths of its model are metres: COLMAP knows no scale."""
+    if "units" in table:
+        return []
+    return [
+        'Lengths are told in metres, as if the model were to scale; units = "unknown" in the scene file tells them in '
+        'units of the map, and units = "metres" says that it is to scale.'
+    ]
+
+
 def model_views(model: ColmapModel, images: Path) -> tuple[list[View], list[str]]:
     """Views of a model's images, by name, and remarks on those left out.
 
@@ -169,6 +190,7 @@ name = "my model"
 model = "sparse/0"        # folder with cameras, images and points3D, binary or text
 images = "images"         # folder of the images
 queries = "night/*"       # a pattern of names, a list of names, or a number n for every n-th image
+units = "unknown"         # COLMAP knows no scale; "metres" if the model is to scale
 
 [gravity]                 # optional
 map = [0.0, 0.0, -1.0]    # down; else the mean +y axis of the reference cameras
@@ -192,14 +214,14 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     scene_file.check_keys(gravity, set(), {"map"}, f"{where} [gravity]")
     settings = map_scene.read_settings(table | {"gravity": shared_gravity}, where, GRAVITY_BOUND_DEG)
     images = map_scene.folder(table, "images", path)
-    model = read_model(map_scene.folder(table, "model", path))
+    model = read_map(map_scene.folder(table, "model", path))
     chosen = set(_chosen(table["queries"], list(model.images), where))
     model, left_out = without_queries(model, chosen, where)
     views, remarks = model_views(model, images)
     references = tuple(view for view in views if view.name not in chosen)
     down, assumed = gravity_of_map(gravity, references, where)
     queries = (view for view in views if view.name in chosen)
-    remarks = [*remarks, *left_out, *assumed]
+    remarks = [*remarks, *left_out, *assumed, *assumed_units(table)]
     return settings.scene(
         path,
         queries,

@@ -10,6 +10,7 @@ from pathlib import Path
 from spherloc.errors import InputError, shorten
 from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in, read_file
 
+ARCHIVES = {".7z", ".bz2", ".gz", ".rar", ".tar", ".tgz", ".xz", ".zip"}
 VIDEOS = {".360", ".avi", ".insv", ".m4v", ".mkv", ".mov", ".mp4", ".webm"}
 SCENE = "give the path of a scene file (TOML) or a bundled scene's name, which spherloc scenes lists"
 COMMAND = re.compile(r": spherloc [^;]*$")
@@ -31,6 +32,10 @@ _FILES = {
         f"the folder with cameras, images and points3D is the map, and {_COLMAP}",
     ),
     ".h5": ("an HDF5 file, such as hloc writes", "a scene of kind hloc names it: spherloc scenes hloc prints one"),
+    ".pdf": (
+        "a PDF document",
+        "save the photographs in it as JPEG or PNG files, then make a map of their folder with: spherloc map FOLDER",
+    ),
     ".ply": ("a point cloud or a mesh", "a scene of kind newer-college names it as prior_map"),
     ".vrs": (
         "a recording of Project Aria's glasses",
@@ -63,10 +68,12 @@ def _file(path: Path) -> tuple[str, str]:
     suffix, folder = path.suffix.lower(), _quoted(path.parent)
     if suffix in IMAGES:
         return "an image", f"make a map of all images of its folder with: spherloc map {folder}"
+    if suffix in ARCHIVES:
+        return "an archive", "unpack it, and give the folder or the file that comes out of it"
     if suffix in VIDEOS:
         return "a video", f"make a map of its frames with: spherloc map frames --video {_quoted(path)}"
     what, advice = _FILES.get(suffix, ("not a scene file", ""))
-    return what, f"{advice}; else {SCENE}" if advice else SCENE
+    return what, advice if suffix == ".pdf" else f"{advice}; else {SCENE}" if advice else SCENE
 
 
 def _folder(path: Path) -> tuple[str, str]:
@@ -102,6 +109,10 @@ def _folder(path: Path) -> tuple[str, str]:
         video = _quoted(path / videos[0])
         advice = f"make a map of the frames of one with: spherloc map frames --video {video}"
         return _counted(len(videos), "video"), advice
+    if deeper := images_below(path):
+        where, count = deeper
+        what = f"a folder without images, but with {count:,} deeper in it, in {where}"
+        return what, f"make a map of these with: spherloc map {_quoted(where)}"
     return ("an empty folder" if not names else "a folder without images or scene files"), SCENE
 
 
@@ -127,6 +138,25 @@ def images_in_folders(path: Path, names: Sequence[str], most: int | None = None)
         except InputError:
             continue
     return {name: count for name, count in counts.items() if count}
+
+
+def images_below(path: Path) -> tuple[Path, int] | None:
+    """A folder in ``path``, at any depth, that has two images or more, or that has several such folders, and how many.
+
+    The one that is least deep, the first by name; None if there is none among the first ``MAX_FOLDERS`` folders.
+    """
+    folders = [path]
+    for place in folders:  # grows: those of the next level come after those of this one
+        try:
+            names = [name for name in names_in(place) if not name.startswith(".")]
+        except InputError:
+            continue
+        inside = [count for count in images_in_folders(place, names, MAX_FOLDERS).values() if count > 1]
+        count = sum(inside) if len(inside) > 1 else _images(names)
+        if count > 1:
+            return place, count
+        folders += [place / name for name in names if is_folder(place / name)][: MAX_FOLDERS - len(folders)]
+    return None
 
 
 def _counted(count: int, what: str) -> str:

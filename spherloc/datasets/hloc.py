@@ -18,11 +18,10 @@ import numpy as np
 
 from spherloc.cameras.base import Camera
 from spherloc.datasets import map_scene, scene_file
-from spherloc.datasets.colmap import gravity_of_map, model_views, some, split_gravity
+from spherloc.datasets.colmap import assumed_units, gravity_of_map, model_views, read_map, some, split_gravity
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, shorten, show
 from spherloc.files import is_file
-from spherloc.formats.colmap_files import read_model
 from spherloc.formats.colmap_model import ColmapModel
 from spherloc.formats.hloc_files import (
     Hdf5,
@@ -187,6 +186,7 @@ pairs = "outputs/pairs-netvlad.txt"        # rows: query reference, the most sim
 features = "outputs/feats.h5"              # of the queries
 matches = "outputs/matches.h5"             # of the pairs
 truth = "outputs/results.txt"              # optional, rows: name qw qx qy qz tx ty tz
+units = "unknown"                          # COLMAP knows no scale; "metres" if the model is to scale
 
 [gravity]                                  # optional
 map = [0.0, 0.0, -1.0]                     # down; else the mean +y axis of the reference cameras
@@ -215,14 +215,14 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     scene_file.check_keys(gravity, set(), {"map"}, f"{where} [gravity]")
     settings = map_scene.read_settings(table | {"gravity": shared_gravity}, where, GRAVITY_BOUND_DEG)
     images = map_scene.folder(table, "images", path)
-    model = read_model(map_scene.folder(table, "model", path))
+    model = read_map(map_scene.folder(table, "model", path))
     references, remarks = model_views(model, images)
     down, assumed = gravity_of_map(gravity, references, where)
     cameras, skipped = read_queries(_file(table, "queries", path))
     truth, unknown = _truth(_file(table, "truth", path), cameras) if "truth" in table else ({}, [])
     queries, missing = _queries(cameras, images, truth)
     pairs, unpaired = _pairs(table, path, queries, references)
-    said = (*remarks, *assumed, *skipped, *unknown, *missing, *unpaired)
+    said = (*remarks, *assumed, *assumed_units(table), *skipped, *unknown, *missing, *unpaired)
     matcher = _matcher(table, path, model, tuple(references), pairs)
     others = {"matcher": matcher, "assumed_down": bool(assumed), "cloud": model.points.xyz}
     named = [key for key in ("features", "matches", "pairs", "global_features") if key in table]

@@ -15,11 +15,18 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets import map_scene, scene_file
-from spherloc.datasets.colmap import gravity_of_map, model_views, some, split_gravity, unit_vector
+from spherloc.datasets.colmap import (
+    assumed_units,
+    gravity_of_map,
+    model_views,
+    read_map,
+    some,
+    split_gravity,
+    unit_vector,
+)
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, shorten, show
 from spherloc.files import IMAGES, is_file, is_image, names_in, size_of
-from spherloc.formats.colmap_files import read_model
 from spherloc.frontend.lifting import DepthLift
 from spherloc.frontend.partners import with_triangulation
 from spherloc.frontend.pipeline import frontend_options
@@ -190,6 +197,8 @@ calibration = "camera.yaml"     # of the queries: any file that spherloc reads; 
 # images = "left*"              # a pattern of names, or a list of names
 # calibration = "left.yaml"     # or camera = {...}
 
+# units = "unknown"             # of a model without a scale in [map]; "metres" if it is to scale
+
 [map]                           # the references are a COLMAP model ...
 model = "sparse/0"
 images = "mapping"
@@ -257,6 +266,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     references, more, cloud = _references(table, cameras.shared, settings.frontend, path)
     down, assumed = gravity_of_map(gravity, references, where)
     remarks = [*remarks, *more, *_in_the_map(queries, references), *assumed]
+    remarks += assumed_units(table) if "map" in table else []
     return settings.scene(path, queries, references, down, remarks, assumed_down=bool(assumed), cloud=cloud)
 
 
@@ -319,7 +329,7 @@ def _references(
     section = scene_file.section(table, "map", str(path))
     scene_file.check_keys(section, {"model", "images"}, set(), f"{path} [map]")
     images = map_scene.folder(section, "images", path)
-    model = read_model(map_scene.folder(section, "model", path))
+    model = read_map(map_scene.folder(section, "model", path))
     views, remarks = model_views(model, images)
     return tuple(views), remarks, model.points.xyz
 

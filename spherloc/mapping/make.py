@@ -14,8 +14,8 @@ from spherloc.mapping.carried import carried_nadir_deg
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.line_gravity import GravityByLines, gravity_by_lines
 from spherloc.mapping.model import Reconstruction
+from spherloc.mapping.new_images import NewImages
 from spherloc.mapping.parallel import Tell
-from spherloc.mapping.photographs import NewImages
 from spherloc.mapping.positions import Positions, gps_of_images
 from spherloc.mapping.reconstruction import DATABASES, reconstruct
 from spherloc.mapping.scene_files import SCENE

@@ -10,8 +10,9 @@ from spherloc.errors import InputError, StoppedError, reason
 from spherloc.files import is_folder
 from spherloc.formats.colmap_files import read_model
 from spherloc.frontend.view import View
-from spherloc.mapping.photographs import Photographs, cameras_of, new_images_of, with_cameras
-from spherloc.mapping.scene_files import MODEL, UNITS_UNKNOWN, MapHead, toml_value, write_new_scene
+from spherloc.mapping.new_images import new_images_of
+from spherloc.mapping.photographs import Photographs, cameras_of, with_cameras
+from spherloc.mapping.scene_files import MODEL, UNITS_METRES, UNITS_UNKNOWN, MapHead, toml_value, write_new_scene
 
 SECTIONS = ("gravity", "frontend", "masks")
 """Sections of a scene file that are the same for all queries of a map."""
@@ -38,7 +39,7 @@ def add_new_images(scene: Path, folder: Path) -> tuple[Path, tuple[str, ...]]:
     """Write a scene file whose queries are the images in ``folder``, in the map of the scene file ``scene``.
 
     Returns its path, and remarks on images that are left out. Raises ``InputError`` if ``scene`` is none of a map, if a
-    file of the map cannot be read, or if no image is of a camera of the map, and ``StoppedError`` if the file cannot be
+    file of the map cannot be read, or if the camera of no image is known, and ``StoppedError`` if the file cannot be
     written.
     """
     table, images = read_table(scene), map_images(scene)
@@ -51,7 +52,7 @@ def add_new_images(scene: Path, folder: Path) -> tuple[Path, tuple[str, ...]]:
         name=_name(table),
         about=str(table.get("about", "")),
         images=own["images"],
-        units=(UNITS_UNKNOWN,) if table.get("units") == "unknown" else (),
+        units=UNITS_UNKNOWN if table.get("units") == "unknown" else UNITS_METRES,
         sections=tuple(line for name in SECTIONS for line in _section(table, name, str(scene))),
     )
     try:

@@ -12,12 +12,12 @@ import numpy as np
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.datasets.given_path import SCENE, images_in_folders, what_it_is
+from spherloc.datasets.given_path import SCENE, images_below, images_in_folders, what_it_is
 from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in, write_whole
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
-from spherloc.images import check_image, grey, read_eighth, read_image, read_size
+from spherloc.images import check_image, grey, read_eighth, read_image
 from spherloc.mapping.advice import advice
 from spherloc.mapping.image_circle import BLACK
 from spherloc.mapping.lens import for_colmap
@@ -61,15 +61,6 @@ class Photographs:
     """Those that the images themselves told, by their folder in that of the map; empty for that itself."""
 
 
-@dataclass(frozen=True)
-class NewImages:
-    """Images that are to be localized in a map."""
-
-    folder: Path
-    views: tuple[View, ...] | None
-    """With their cameras, named by the path in the folder; None for all images there, of the map's one camera."""
-
-
 def photographs(
     folder: Path,
     cameras: Mapping[str, Camera],
@@ -100,7 +91,11 @@ def photographs(
 
 
 def with_cameras(
-    folder: Path, cameras: Mapping[str, Camera], panorama: bool = False, find_lens: LensFinder | None = None
+    folder: Path,
+    cameras: Mapping[str, Camera],
+    panorama: bool = False,
+    find_lens: LensFinder | None = None,
+    of_map: Mapping[str, Camera] | None = None,
 ) -> Photographs:
     """The images of a folder or, if it has none, of the folders in it, with their cameras.
 
@@ -111,10 +106,13 @@ def with_cameras(
     count as panoramas where no camera has their size, and if ``panorama`` in any case. If no camera is known of the
     images of a folder, ``find_lens`` calibrates that of those of one size, the most frequent.
 
+    Of images that are to be localized in a map, ``of_map`` are the cameras of that, by name; they count for sizes for
+    which there is no calibration. Those images may have any camera model, not only one of COLMAP's.
+
     Raises ``InputError`` if the folder has no photographs, if their camera is unknown, or if it has no model in COLMAP.
     """
     if not is_folder(folder):
-        raise InputError(what_it_is(folder) or f"{folder}: is not a folder; give the folder of the photographs.")
+        raise InputError(_known(folder) or f"{folder}: is not a folder; give the folder of the photographs.")
     there = names_in(folder)
     inside = images_in_folders(folder, [name for name in there if not is_image(name)])
     views: list[View] = []
@@ -122,9 +120,9 @@ def with_cameras(
     known = dict(cameras)
     calibrated: dict[str, CalibratedLens] = {}
     if any(is_image(name) for name in there) or not inside:
-        beside = _beside(folder, "")
+        beside = calibrations_in(folder)
         known = known or dict(beside.cameras)
-        views, remarks, lens = _of_folder(folder, "", cameras, beside, panorama, find_lens)
+        views, remarks, lens = _of_folder(folder, "", cameras, beside, panorama, find_lens, of_map)
         calibrated |= {} if lens is None else {"": lens}
         remarks += _about_subfolders(inside)
     else:
@@ -133,10 +131,11 @@ def with_cameras(
         for name in folders:
             try:
                 given, common = (_belonging(some, name, folders) for some in (cameras, shared))
-                beside = _beside(folder, name)
+                mapped = None if of_map is None else _belonging(of_map, name, folders)
+                beside = calibrations_in(folder, name)
                 if not beside.cameras:
                     beside = replace(beside, cameras=common)
-                found, about, lens = _of_folder(folder, name, given, beside, panorama, find_lens)
+                found, about, lens = _of_folder(folder, name, given, beside, panorama, find_lens, mapped)
                 calibrated |= {} if lens is None else {name: lens}
             except InputError as error:
                 found, about = [], [f"It is left out: {error}"]
@@ -144,50 +143,13 @@ def with_cameras(
             if len(cameras_of(found)) == 1:
                 known[name] = found[0].camera
             remarks += [f"{shorten(name)}: {remark}" for remark in about]
+        remarks += _about_deeper(folder, [name for name in there if name not in inside])
     return Photographs(tuple(views), tuple(remarks), known, calibrated)
 
 
 def cameras_of(views: Sequence[View]) -> dict[str, Camera]:
     """The different cameras of the views, by how they are described."""
     return {repr(view.camera): view.camera for view in views}
-
-
-def new_images_of(folder: Path, mapped: Photographs, panorama: bool = False) -> tuple[NewImages, tuple[str, ...]]:
-    """The images of a folder that are to be localized in the map of others, and remarks on those that cannot be.
-
-    Where the map has several cameras, each image has one of these, as ``with_cameras`` tells. Raises ``InputError`` if
-    there is no image, or none of a camera of the map.
-    """
-    if not is_folder(folder):
-        raise InputError(f"{folder}: is not a folder; give one with images that are to be localized.")
-    if len(cameras_of(mapped.views)) > 1:
-        found = with_cameras(folder, mapped.cameras, panorama)
-        if not found.views:
-            raise InputError(f"{folder}: no image is of a camera of the map. {' '.join(found.remarks)}")
-        return NewImages(folder, found.views), found.remarks
-    names = [name for name in names_in(folder) if is_image(name)]
-    if not names:
-        raise InputError(f"{folder}: has no images; give a folder with images that are to be localized.")
-    camera = mapped.views[0].camera
-    others = [name for name in names if not _of_camera(folder / name, camera)]
-    size = f"{camera.width} x {camera.height} pixels, as the map's camera has"
-    if len(others) == len(names):
-        raise InputError(f"{folder}: none of its {len(names)} images can be read and has {size}; give others.")
-    if not others:
-        return NewImages(folder, None), ()
-    return NewImages(folder, None), (
-        f"{len(others)} of {len(names)} images will be left out, not {size}: {_some(others)}.",
-    )
-
-
-def _of_camera(path: Path, camera: Camera) -> bool:
-    """Whether an image can be read and is of the camera by its size; panoramas are of any size."""
-    try:
-        width, height = read_size(path)
-    except InputError:
-        return False
-    panorama = isinstance(camera, Equirectangular) and width == 2 * height
-    return panorama or (width, height) == (camera.width, camera.height)
 
 
 def _belonging(cameras: Mapping[str, Camera], folder: str, folders: Sequence[str]) -> Mapping[str, Camera]:
@@ -210,12 +172,14 @@ def _of_folder(
     beside: "FoundCalibrations",
     panorama: bool,
     find_lens: LensFinder | None,
+    of_map: Mapping[str, Camera] | None,
 ) -> tuple[list[View], list[str], CalibratedLens | None]:
     """The images of the folder ``inside`` of ``root``, or of ``root`` itself if that is empty, remarks on others, and
     the camera that ``find_lens`` found, if it was needed.
 
-    ``given`` are the cameras that the user gave, ``beside`` those of files beside the images. Raises ``InputError`` if
-    it has no images, or if their camera is unknown or has no model in COLMAP.
+    ``given`` are the cameras that the user gave, ``beside`` those of files beside the images, ``of_map`` those of the
+    map in which the images are to be localized, else None. Raises ``InputError`` if it has no images, or if their
+    camera is unknown or, without ``of_map``, has no model in COLMAP.
     """
     folder = root / inside
     sizes: dict[tuple[int, int], list[str]] = {}
@@ -230,11 +194,16 @@ def _of_folder(
             damaged.append(name)
     remarks = [*_about_damaged(damaged), *_about_unread(others)]
     if not sizes:
-        raise InputError(_without_photographs(folder, remarks))
-    cameras = given if given or panorama else beside.cameras
+        raise InputError(_without_photographs(folder, remarks, of_map is not None))
+    cameras = given or {
+        name: camera for name, camera in beside.cameras.items() if not panorama or camera.width != 2 * camera.height
+    }
     camera_of: dict[str, Camera] = {}
     for size, names in sizes.items():
         found, about = _with_cameras(names, size, cameras)
+        if of_map:
+            others_of_map, about_them = _with_cameras([name for name in names if name not in found], size, of_map)
+            found, about = found | others_of_map, about + about_them
         if not given and not found and size[0] == 2 * size[1] >= MIN_PANORAMA_PX:
             raw = [name for name in names if not panorama and _is_raw(folder / name, size[1])]
             found = {name: Equirectangular(*size) for name in names if name not in raw}
@@ -254,6 +223,10 @@ def _of_folder(
         files = "their calibration" if len(sizes) == 1 else "a file with the calibrations of all of them"
         put_it = advice("calibration").format(files=files)
         unknown = f"{folder}: its photographs, {told}, are not full panoramas (2 to 1)"
+        if of_map is not None:
+            lenses = [camera for camera in of_map.values() if not isinstance(camera, Equirectangular)]
+            nor = f" and of no camera of the map ({_sizes(lenses)} pixels)" if lenses else ""
+            raise InputError(" ".join((f"{unknown}{nor}; put {files} into that folder.", *unused)))
         if find_lens is None:
             raise InputError(" ".join((f"{unknown}; {put_it}.", *unused)))
         try:
@@ -266,24 +239,30 @@ def _of_folder(
         remarks.append(lens[1])
     if rest:
         width, height = next(size for size, names in sizes.items() if rest[0] in names)
-        sizes_given = sorted({(camera.width, camera.height) for camera in given.values()})
-        those = " and ".join(f"{one} x {other}" for one, other in sizes_given[:MAX_NAMED])
-        of_another_size = bool(given) and (width, height) not in sizes_given
+        of_another_size = bool(given) and all((one.width, one.height) != (width, height) for one in given.values())
+        and_so = f", but the calibration is for {_sizes(given.values())}." if of_another_size else "."
+        if of_map is not None:
+            and_so = "; put its calibration into that folder."
         remarks.append(
             f"{len(rest)} of {len(rest) + len(camera_of)} images were left out, as their camera is not known; the "
-            f"first is {shorten(rest[0])} with {width} x {height} pixels"
-            + (f", but the calibration is for {those}." if of_another_size else ".")
+            f"first is {shorten(rest[0])} with {width} x {height} pixels{and_so}"
         )
     for_model: dict[str, Camera] = {}
     for camera in camera_of.values():
         if repr(camera) not in for_model:
-            for_model[repr(camera)], about_lens = for_colmap(camera)
+            for_model[repr(camera)], about_lens = for_colmap(camera) if of_map is None else (camera, "")
             remarks += [about_lens] if about_lens else []
     views = [
         View((Path(inside) / name).as_posix(), for_model[repr(camera_of[name])], folder / name)
         for name in sorted(camera_of)
     ]
     return views, remarks, lens
+
+
+def _sizes(cameras: Collection[Camera]) -> str:
+    """The different sizes of cameras: "400 x 300 and 640 x 480"."""
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    return " and ".join(f"{width} x {height}" for width, height in sizes[:MAX_NAMED])
 
 
 def _with_cameras(
@@ -342,8 +321,9 @@ class FoundCalibrations:
         return [f"{told} has its size: scale it to that of the photographs.", *self.refused[:MAX_NAMED]]
 
 
-def _beside(root: Path, inside: str) -> FoundCalibrations:
-    """Cameras of the calibration files in a folder, and of one beside it that has its name."""
+def calibrations_in(root: Path, inside: str = "") -> FoundCalibrations:
+    """Cameras of the calibration files in ``root`` or, with ``inside``, in that folder there, and of one beside it that
+    has its name."""
     files = [root / inside / name for name in names_in(root / inside)]
     files += [root / name for name in names_in(root) if inside and Path(name).stem == inside]
     return _of_files(files)
@@ -396,14 +376,33 @@ def _about_subfolders(inside: Mapping[str, int]) -> list[str]:
     return [f"{left}; put each camera's images into a folder of its own to have them too."]
 
 
-def _without_photographs(folder: Path, remarks: Sequence[str]) -> str:
-    """Why a folder has nothing to map, and what to do."""
+def _about_deeper(root: Path, names: Sequence[str]) -> list[str]:
+    """A remark on images that are two folders deep or more."""
+    found = [deeper for name in names if is_folder(root / name) and (deeper := images_below(root / name))]
+    if not found:
+        return []
+    where, count = found[0]
+    return [f"{_were(count, 'image')} left out, deeper in the folder, in {where}; give that folder to have them."]
+
+
+def _known(path: Path) -> str:
+    """What a path is and what takes it, if it is known and no scene file is asked for instead; else empty."""
+    told = what_it_is(path)
+    return "" if SCENE in told else told
+
+
+def _without_photographs(folder: Path, remarks: Sequence[str], new: bool) -> str:
+    """Why a folder has nothing to map or, if its images are ``new``, to localize, and what to do."""
     if remarks:
         return f"{folder}: has no photographs that can be read. {' '.join(remarks)}"
-    known = what_it_is(folder)
-    if known and SCENE not in known:
-        return known
-    return f"{folder}: has no photographs ({', '.join(sorted(IMAGES))}); give the folder that has them."
+    if new:
+        deeper = images_below(folder)
+        if deeper:
+            return f"{folder}: has no images, but {deeper[1]} deeper in it, in {deeper[0]}; give that folder."
+        return f"{folder}: has no images; give a folder with images that are to be localized."
+    return (
+        _known(folder) or f"{folder}: has no photographs ({', '.join(sorted(IMAGES))}); give the folder that has them."
+    )
 
 
 def _counted(count: int, what: str) -> str:

@@ -15,7 +15,8 @@ from spherloc.errors import InputError, SpherlocError
 from spherloc.files import is_file, is_folder
 from spherloc.frontend.view import View
 from spherloc.mapping.advice import advice
-from spherloc.mapping.photographs import CalibratedLens, NewImages, cameras_of
+from spherloc.mapping.new_images import NewImages
+from spherloc.mapping.photographs import CalibratedLens, cameras_of
 
 MODEL = "model"
 """Folder of COLMAP's model in that of the map."""
@@ -27,6 +28,7 @@ LENS = "lens.toml"
 """Calibration file of a lens that the map's images told."""
 COMMENT_WIDTH = 110
 UNITS_UNKNOWN = 'units = "unknown"             # lengths are told in units of the map'
+UNITS_METRES = 'units = "metres"'
 EVERY = 4
 """Every fourth image of the map is a query of the scene file, localized against the others."""
 
@@ -40,8 +42,8 @@ class MapHead:
     about: str
     images: str
     """Folder of the map's images, relative to the scene files."""
-    units: tuple[str, ...]
-    """The line that says that the unit is unknown, if it is."""
+    units: str
+    """The line that says whether lengths are metres."""
     sections: tuple[str, ...]
     """The sections [gravity], [frontend] and [masks]."""
 
@@ -54,7 +56,7 @@ def scene_text(head: MapHead, names: Sequence[str]) -> str:
         f"about = {toml_text(head.about)}",
         f"model = {toml_text(MODEL)}",
         f"images = {toml_text(head.images)}",
-        *head.units,
+        head.units,
         "# Localized against the other images; those of the map that you name here are left out of it.",
         f"queries = {_names(names[EVERY - 1 :: EVERY] or names[-1:])}",
         *head.sections,
@@ -70,7 +72,7 @@ def new_scene_text(head: MapHead, folder: Path, new_images: NewImages, camera: C
         f"name = {toml_text(f'{new_images.folder.resolve().name} in {head.name}')}",
         f"about = {toml_text(head.about)}",
         f"images = {toml_text(relative(new_images.folder, folder))}",
-        *head.units,
+        head.units,
         *_queries(new_images.views or (), camera),
         "",
         "[map]",

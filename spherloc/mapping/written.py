@@ -12,10 +12,11 @@ from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.model import Reconstruction
-from spherloc.mapping.photographs import NewImages
+from spherloc.mapping.new_images import NewImages
 from spherloc.mapping.scene_files import (
     MODEL,
     SCENE,
+    UNITS_METRES,
     UNITS_UNKNOWN,
     MapHead,
     new_scene_text,
@@ -88,7 +89,7 @@ def write_map(
         _name(images, scale),
         _about(made, level, scale, len(views)),
         relative(images, folder),
-        () if scale.source else (UNITS_UNKNOWN,),
+        UNITS_METRES if scale.source else UNITS_UNKNOWN,
         (*_gravity(level, kept.gravity, folder), *_kept(kept, folder)),
     )
     try:

@@ -295,8 +295,9 @@ def map(
         seam: Leave out so many degrees on both sides of the seam between the two lenses of a 360-degree camera.
         features: What is matched: sift, aliked with LightGlue (the extra learned), or both; without it, both if that
             extra is installed.
-        localize: Folder of other images of that camera, which are localized in the map as by spherloc localize; a scene
-            is written that has them as queries.
+        localize: Folder of other images, which are localized in the map as by spherloc localize; a scene is written
+            that has them as queries. Of another camera than the map's they need its calibration beside them, unless
+            they are panoramas.
         play: Open the playground on it in the end.
     """
     import numpy as np

@@ -34,15 +34,15 @@ from spherloc.mapping.advice import advice, for_a_page
 from spherloc.mapping.kept_scale import FILE as SCALE_FILE
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
 from spherloc.mapping.make import Map, MapRequest, ScaleMeasurement, make_map
+from spherloc.mapping.new_images import NewImages, new_images_of
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.photographs import (
     CalibratedLens,
     LensFinder,
-    NewImages,
     Photographs,
+    calibrations_in,
     cameras_of,
     frames_of,
-    new_images_of,
     photographs,
 )
 from spherloc.mapping.positions import read_positions
@@ -154,7 +154,8 @@ class Finished:
 
 def _lens_finder(tell: Tell, folder: Path, target: Path, new_images: Path | None) -> LensFinder:
     """What calibrates a lens of the photographs in ``folder``, or in a folder there, by them and by the new images of
-    their size; a lens that is kept in ``target``, the folder of the map, is taken instead."""
+    their size, if there is no calibration for these; a lens that is kept in ``target``, the folder of the map, is taken
+    instead."""
 
     def find(paths: Sequence[Path], size: tuple[int, int]) -> CalibratedLens:
         from spherloc.mapping.unknown_lens import find_lens
@@ -165,12 +166,17 @@ def _lens_finder(tell: Tell, folder: Path, target: Path, new_images: Path | None
         if kept is not None and (kept.width, kept.height) == size:
             return kept, f"The lens is that of {path}, as before; that file says where it is from, and may be removed."
         more: list[Path] = []
-        if new_images is not None and is_folder(new_images):
+        if new_images is not None and is_folder(new_images) and not _calibrated(new_images, size):
             new = [new_images / name for name in names_in(new_images) if is_image(name)]
             more = [path for path in new if _has_size(path, size)]
         return find_lens([*paths, *more], size, tell)
 
     return find
+
+
+def _calibrated(folder: Path, size: tuple[int, int]) -> bool:
+    """Whether a calibration for images of that size lies in a folder."""
+    return any((camera.width, camera.height) == size for camera in calibrations_in(folder).cameras.values())
 
 
 def _has_size(path: Path, size: tuple[int, int]) -> bool:

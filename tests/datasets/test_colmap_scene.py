@@ -77,10 +77,42 @@ def test_down_is_that_of_the_upright_cameras_or_as_stated(rng, tmp_path):
     assert scene.gravity_map[1] > 0.99
     assert any("mean +y axis of the reference cameras" in remark for remark in scene.remarks)
     assert scene.gravity_bound_rad == pytest.approx(np.radians(3.0))
-    path = scene_file(tmp_path, "3", "[gravity]\nmap = [0, 0, -2]\nbound_deg = 1.5\n")
+    path = scene_file(tmp_path, "3", 'units = "metres"\n[gravity]\nmap = [0, 0, -2]\nbound_deg = 1.5\n')
     scene = load_scene(path)
     np.testing.assert_array_equal(scene.gravity_map, [0, 0, -1])
     assert scene.gravity_bound_rad == pytest.approx(np.radians(1.5)) and scene.remarks == ()
+
+
+def test_a_scene_that_does_not_say_its_unit_has_a_remark(rng, tmp_path):
+    """COLMAP knows no scale, so that metres are an assumption."""
+    make_tree(tmp_path, sample_model(rng))
+    assumed = "Lengths are told in metres, as if the model were to scale"
+    scene = load_scene(scene_file(tmp_path))
+    assert scene.metric and any(remark.startswith(assumed) for remark in scene.remarks)
+    for units, metric in (("unknown", False), ("metres", True)):
+        scene = load_scene(scene_file(tmp_path, "2", f'units = "{units}"\n'))
+        assert scene.metric == metric and not any(assumed in remark for remark in scene.remarks)
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        'kind = "colmap"\nmodel = "sparse/0"\nimages = "images"\nqueries = 2\n',
+        'kind = "image-folder"\nimages = "images"\ncamera = {model = "equirectangular", width = 64, height = 32}\n'
+        '[map]\nmodel = "sparse/0"\nimages = "images"\n',
+        'kind = "hloc"\nmodel = "sparse/0"\nimages = "images"\nqueries = "queries.txt"\n',
+    ],
+)
+def test_a_model_without_points_is_no_map(keys, rng, tmp_path):
+    sample = sample_model(rng)
+    images = [(*image[:4], [(u, v, NO_POINT) for u, v, _ in image[4]]) for image in sample.images]
+    make_tree(tmp_path, replace(sample, images=images, points=[]))
+    (tmp_path / "images" / "a.png").touch()
+    (tmp_path / "scene.toml").write_text(f'name = "bare"\n{keys}')
+    with pytest.raises(
+        InputError, match=r"sparse.0: the COLMAP model has no points, .*; make them with colmap point_tr"
+    ):
+        load_scene(tmp_path / "scene.toml")
 
 
 def test_cameras_that_are_not_upright_do_not_show_down(rng, tmp_path):

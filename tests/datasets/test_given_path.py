@@ -3,7 +3,7 @@
 import pytest
 
 from spherloc.datasets import load_scene
-from spherloc.datasets.given_path import what_it_is
+from spherloc.datasets.given_path import images_below, what_it_is
 from spherloc.datasets.scene_file import check_there
 from spherloc.errors import InputError
 
@@ -29,6 +29,10 @@ def filled(folder, *names):
         (["results.jsonl", "trajectory.png"], "is a folder of results of spherloc localize; list its runs with"),
         (["a.rrd", "b.rrd"], "is a folder of 2 recordings; list them with: spherloc runs "),
         (["a.toml"], "is a folder of 1 scene file; give one of them, such as "),
+        (
+            ["day1/left/1.png", "day1/left/2.png", "notes/a.txt", ".thumbnails/small/1.png", ".thumbnails/small/2.png"],
+            "is a folder without images, but with 2 deeper in it, in ",
+        ),
         (["a.mp4"], "is a folder of 1 video; make a map of the frames of one with: spherloc map "),
         ([], "is an empty folder; give the path of a scene file"),
         (["notes.txt"], "is a folder without images or scene files; give the path of a scene file"),
@@ -44,6 +48,20 @@ def test_folders(tmp_path, names, said):
             ask(folder)
         assert str(caught.value) == told
     assert "'" in told or "spherloc map" not in told  # a path with a space is quoted for the shell
+
+
+def test_images_deeper_in_a_folder_are_found(tmp_path):
+    """The folder of the folders of several cameras where it has these, the least deep one first. One picture alone is
+    that of a result."""
+    filled(tmp_path, "a/b/c/1.png", "a/b/c/2.png", "recordings/one/trajectory.png", "recordings/other/trajectory.png")
+    day = tmp_path / "trip" / "day1"
+    filled(day, "left/1.png", "left/2.png", "right/1.png", "right/2.png", "../day2/1.png")
+    assert images_below(tmp_path) == (day, 4)
+    assert images_below(tmp_path / "a") == (tmp_path / "a" / "b" / "c", 2)
+    assert images_below(tmp_path / "recordings") is None and images_below(tmp_path / "trip" / "day2") is None
+    (tmp_path / "a" / "b" / "around").symlink_to(tmp_path / "a")
+    (tmp_path / "a" / "b" / "c" / "1.png").unlink()
+    assert images_below(tmp_path / "a") is None, "a folder that is in itself ends, too"
 
 
 def test_other_files_that_end_like_scene_files_are_none(tmp_path):
@@ -67,13 +85,16 @@ def test_other_files_that_end_like_scene_files_are_none(tmp_path):
         ("database.db", "is a COLMAP database"),
         ("matches.csv", "is a table; its matches are solved by a scene of kind correspondences"),
         ("camera.yaml", "is a YAML file; a calibration is named by the key 'calibration'"),
+        ("photos.ZIP", "is an archive; unpack it, and give the folder or the file that comes out of it."),
+        ("map.tar.gz", "is an archive; unpack it"),
+        ("paper.pdf", "is a PDF document; save the photographs in it as JPEG or PNG files, then make a map of their"),
         ("README.md", "is not a scene file; give the path of a scene file (TOML) or a bundled scene's name"),
     ],
 )
 def test_files(tmp_path, name, said):
     path = filled(tmp_path, name) / name
     assert what_it_is(path).startswith(f"{path}: {said}")
-    with pytest.raises(InputError, match=r"spherloc|calibration"):
+    with pytest.raises(InputError, match=r"spherloc|calibration|unpack"):
         check_there(path)
 
 

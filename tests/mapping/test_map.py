@@ -17,15 +17,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from spherloc import registry
+from spherloc.cameras.double_sphere import DoubleSphere
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.query_gravity import read_gravity
 from spherloc.errors import CalibrationError, InputError
+from spherloc.estimators import estimate
 from spherloc.formats.colmap_files import read_model
 from spherloc.frontend import trained
 from spherloc.frontend.masks import Masks
+from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.advice import COMMAND, PAGE, for_a_page
 from spherloc.mapping.later import place_rest
@@ -33,23 +36,26 @@ from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.line_gravity import gravity_by_lines
 from spherloc.mapping.make import MapRequest, ScaleMeasurement, make_map, scale_of
 from spherloc.mapping.misplaced import without_misplaced
+from spherloc.mapping.new_images import NewImages, new_images_of
 from spherloc.mapping.new_queries import add_new_images, map_images
-from spherloc.mapping.photographs import (
-    NewImages,
-    Photographs,
-    _is_in,
-    frames_of,
-    new_images_of,
-    photographs,
-    two_circles,
+from spherloc.mapping.photographs import Photographs, _is_in, frames_of, photographs, two_circles
+from spherloc.mapping.scene_files import (
+    MODEL,
+    SCENE,
+    UNITS_UNKNOWN,
+    MapHead,
+    _camera,
+    _queries,
+    check_images_of,
+    write_new_scene,
 )
-from spherloc.mapping.scene_files import MODEL, SCENE, MapHead, _camera, _queries, check_images_of, write_new_scene
 from spherloc.mapping.stated_gravity import read_stated_gravity
 from spherloc.mapping.upright import Level, level_of, scale_by_height, upright_frame
 from spherloc.mapping.written import _gravity
 from spherloc.problem import Problem
 from spherloc_viz.commands.image_commands import map as map_command
 from spherloc_viz.commands.map import (
+    _calibrated,
     _kind,
     _of_the_map_before,
     _sizes,
@@ -90,6 +96,15 @@ def walk(tmp_path_factory):
         return make_map(MapRequest(found.views, folder, measured, new, masks), output, lambda *what: told.append(what))
 
     return poses, found, again(), again, told, output
+
+
+def cut_out(panorama, camera, panorama_from_camera):
+    """The image (H, W) or (H, W, 3) that another camera takes where a panorama was taken."""
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    bearings, seen = camera.unproject(np.column_stack([columns.ravel(), rows.ravel()]))
+    places, _ = panorama.camera.project(bearings @ panorama_from_camera.T)
+    u, v = np.where(seen[:, None], places - 0.5, -1.0).astype(np.float32).T.reshape(2, camera.height, -1)
+    return cv2.remap(panorama.read(), u, v, cv2.INTER_LINEAR)
 
 
 def test_a_map_has_the_poses_of_the_photographs(walk):
@@ -251,11 +266,29 @@ def test_images_are_added_to_a_map_that_is_made(walk, tmp_path):
     (some / "a.png").write_bytes(found.views[0].path.read_bytes())
     (some / "b.png").write_bytes(b"no image")
     path, remarks = add_new_images(made.written.new_scene, some)
-    assert path.name == "some.toml" and "1 of 2 images will be left out" in remarks[0]
+    assert path.name == "some.toml" and "1 image was left out, damaged or empty: b.png" in remarks[0]
     new = load_scene(path)
     assert [view.name for view in new.queries] == ["a.png"] and new.name == f"some in {images.name}"
     with pytest.raises(InputError, match=r"campus_panorama\.toml: is not the scene of a map"):
         add_new_images(bundled_scenes()["campus_panorama"], some)
+
+
+def test_a_fisheye_is_localized_in_a_map_of_panoramas(walk, tmp_path):
+    """Cut out of a panorama of the map, so that its pose there is known; its calibration lies beside it."""
+    _, found, made, _, _, _ = walk
+    lens = KannalaBrandt(500, 400, 150.0, 150.0, 250.0, 200.0, (0.01, 0.0, 0.0, 0.0))
+    view, turn = found.views[1], so3_exp(np.array([0.1, 0.8, 0.0]))
+    cv2.imwrite(str(tmp_path / "a.png"), cut_out(view, lens, turn))
+    (tmp_path / "lens.toml").write_text("\n".join(["[camera]", *_camera(lens)]))
+    path, _ = add_new_images(made.written.scene, tmp_path)
+    try:
+        scene = load_scene(path)
+        pose = estimate(scene.problem(), "auto").cam_from_map
+    finally:
+        path.unlink()
+    expected = turn.T @ made.written.poses[view.name]
+    assert rotation_angle(pose[:, :3] @ expected[:, :3].T) < np.radians(0.3)
+    assert np.linalg.norm(camera_centre(pose) - camera_centre(expected)) < 0.05
 
 
 def test_what_is_done_is_not_done_again(walk):
@@ -440,12 +473,8 @@ def rig(walk, tmp_path_factory):
         (folder / name).mkdir()
         (folder / f"{name}.toml").write_text(written(camera))
         panorama_from_camera = so3_exp(np.array([0.0, turn_rad, 0.0]))
-        columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        bearings, seen = camera.unproject(np.column_stack([columns.ravel(), rows.ravel()]))
         for view in panoramas.views:
-            places, _ = view.camera.project(bearings @ panorama_from_camera.T)
-            u, v = np.where(seen[:, None], places - 0.5, -1.0).astype(np.float32).T.reshape(2, camera.height, -1)
-            cv2.imwrite(str(folder / name / view.name), cv2.remap(view.read(), u, v, cv2.INTER_LINEAR))
+            cv2.imwrite(str(folder / name / view.name), cut_out(view, camera, panorama_from_camera))
             cut[f"{name}/{view.name}"] = panorama_from_camera.T @ poses[view.name]
     return folder, cut
 
@@ -841,11 +870,16 @@ def test_new_images_are_counted_by_their_size(tmp_path, rng):
     (empty / "notes.txt").write_text("nothing")
     assert _sizes(NewImages(new, None)) == "2 of 400 x 200 pixels, 1 of 300 x 200 pixels, 1 damaged"
     mapped = Photographs(tuple(view for view in photographs(new, {}).views if view.camera.width == 400), (), {})
-    others = "2 of 4 images will be left out, not 400 x 200 pixels, as the map's camera has: c.png, d.jpg."
-    assert new_images_of(new, mapped) == (NewImages(new, None), (others,))
+    found, remarks = new_images_of(new, mapped)
+    assert found == NewImages(new, None), "all that can be are of the map's camera"
+    damaged, unknown = remarks
+    assert damaged.startswith("1 image was left out, damaged or empty: d.jpg;")
+    assert unknown.startswith("1 of 3 images were left out, as their camera is not known; the first is c.png with")
+    assert unknown.endswith("300 x 200 pixels; put its calibration into that folder.")
     for name in ("a.png", "b.png"):
         (new / name).unlink()
-    with pytest.raises(InputError, match="none of its 2 images can be read and has 400 x 200 pixels, as the map's"):
+    words = r"1 of 300 x 200 pixels, are not full panoramas \(2 to 1\); put their calibration into that folder\.$"
+    with pytest.raises(InputError, match=f"new: its photographs, {words}"):
         new_images_of(new, mapped)
     with pytest.raises(InputError, match="empty: has no images; give a folder with images that are to be localized"):
         new_images_of(empty, mapped)
@@ -893,7 +927,7 @@ def test_new_images_of_cameras_that_were_given(tmp_path, rng):
 @pytest.mark.parametrize("name", ["scene", "lens", "lens_front"])
 def test_a_scene_of_new_images_is_not_called_as_another_file_of_the_map(tmp_path, name):
     images = NewImages(tmp_path / name, None)
-    path = write_new_scene(MapHead("m", "", "..", (), ()), tmp_path, images, Equirectangular(64, 32))
+    path = write_new_scene(MapHead("m", "", "..", UNITS_UNKNOWN, ()), tmp_path, images, Equirectangular(64, 32))
     assert path.name == f"new_{name}.toml"
 
 
@@ -926,7 +960,7 @@ def test_new_images_of_several_cameras(tmp_path, rng):
     assert [(view.name, view.camera.fx) for view in inside.views] == [("left/7.png", 90.0), ("right/7.png", 95.0)]
     (tmp_path / "small").mkdir()
     picture(tmp_path / "small" / "left.png", 200, 150, rng)
-    with pytest.raises(InputError, match="no image is of a camera of the map"):
+    with pytest.raises(InputError, match=r"and of no camera of the map \(400 x 300 pixels\); put their calibration in"):
         new_images_of(tmp_path / "small", known)
 
     pose = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, {}]]"
@@ -941,6 +975,92 @@ def test_new_images_of_several_cameras(tmp_path, rng):
         scene = load_scene(tmp_path / "scene.toml")
         assert [(view.name, view.camera) for view in scene.queries] == [(view.name, view.camera) for view in views]
         assert not any("left out" in remark for remark in scene.remarks)
+
+
+def test_new_images_of_other_cameras_than_the_map(tmp_path, rng):
+    """A calibration beside them is theirs, also for images of the map's size; panoramas need none, of whatever size
+    they are. A calibration that COLMAP has no model for is taken as it is, and the scene is read as it was written."""
+    of_map = KannalaBrandt(400, 300, 90.0, 90.0, 200.0, 150.0, (0.0,) * 4)
+    phone = Mei(400, 300, 350.0, 350.0, 200.0, 150.0, xi=0.0, distortion=(0.0,) * 4)
+    headset = DoubleSphere(320, 240, 80.0, 80.0, 160.0, 120.0, xi=-0.2, alpha=0.55)
+    images, model, new, flat = tmp_path / "images", tmp_path / "map" / "model", tmp_path / "new", tmp_path / "flat"
+    for folder in (images, model, new / "phone", new / "headset", new / "round", flat):
+        folder.mkdir(parents=True)
+    for path in (images / "a.png", images / "b.png", new / "phone" / "1.png", flat / "of_map.png"):
+        picture(path, 400, 300, rng)
+    picture(new / "headset" / "1.png", 320, 240, rng)
+    picture(flat / "headset.png", 320, 240, rng)
+    for path, width in ((new / "round" / "1.png", 640), (new / "round" / "2.png", 800), (flat / "round.png", 640)):
+        picture(path, width, width // 2, rng)
+    (new / "phone" / "cameras.txt").write_text("1 PINHOLE 400 300 350 350 200 150\n")
+    lens = "\n".join(["[camera]", *_camera(headset)])
+    (new / "headset.toml").write_text(lens)
+    (flat / "calibration.toml").write_text(lens)
+    (model / "cameras.txt").write_text("1 OPENCV_FISHEYE 400 300 90 90 200 150 0 0 0 0\n")
+    (model / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n211 150 1\n2 1 0 0 0 1 0 0 1 b.png\n233 150 1\n")
+    (model / "points3D.txt").write_text("1 0.5 0 4 128 128 128 0.5 1 0 2 0\n")
+    scene = tmp_path / "map" / "scene.toml"
+    head = f'model = "{MODEL}"\nimages = "../images"\nqueries = ["b.png"]\n[gravity]\nmap = [0.0, 1.0, 0.0]\n'
+    scene.write_text(f'kind = "colmap"\nname = "m"\n{head}[masks]\nseam_deg = 2.0\nimages = "../mask.png"\n')
+    cv2.imwrite(str(tmp_path / "mask.png"), np.full((300, 400), 255, np.uint8))
+    expected = {"phone/1.png": phone, "headset/1.png": headset}
+    expected |= {f"round/{k}.png": Equirectangular(width, width // 2) for k, width in ((1, 640), (2, 800))}
+    path, _ = add_new_images(scene, new)
+    opened = load_scene(path)
+    assert {view.name: view.camera for view in opened.queries} == expected
+    assert {view.camera for view in opened.references} == {of_map}
+    path, remarks = add_new_images(scene, flat)
+    cameras = {"of_map.png": of_map, "headset.png": headset, "round.png": Equirectangular(640, 320)}
+    assert {view.name: view.camera for view in load_scene(path).queries} == cameras
+    assert remarks == ("The calibration found beside them: calibration.",)
+
+
+def test_photographs_deeper_in_a_folder_are_named(tmp_path, rng):
+    """The folder that has them, for a map and to be localized."""
+    day = tmp_path / "trip" / "day 1" / "left"
+    day.mkdir(parents=True)
+    for name in ("1.png", "2.png"):
+        picture(day / name, 400, 200, rng)
+    with pytest.raises(InputError) as caught:
+        photographs(tmp_path, {})
+    said = f"{tmp_path}: is a folder without images, but with 2 deeper in it, in {day}; make a map of these with: "
+    assert str(caught.value) == f"{said}spherloc map '{day}'"
+    mapped = Photographs((View("m.png", Equirectangular(400, 200), tmp_path / "m.png"),), (), {})
+    with pytest.raises(InputError, match=r"has no images, but 2 deeper in it, in .*left; give that folder\.$"):
+        new_images_of(tmp_path, mapped)
+    (tmp_path / "around").mkdir()
+    for name in ("1.png", "2.png"):
+        picture(tmp_path / "around" / name, 400, 200, rng)
+    found = photographs(tmp_path, {})
+    assert [view.name for view in found.views] == ["around/1.png", "around/2.png"]
+    left_out = f"2 images were left out, deeper in the folder, in {day}; give that folder to have them."
+    assert found.remarks == (left_out,) and new_images_of(tmp_path, mapped)[1] == (left_out,)
+    (tmp_path / "new.zip").write_bytes(b"PK")
+    for ask in (lambda path: photographs(path, {}), lambda path: new_images_of(path, mapped)):
+        with pytest.raises(InputError, match=r"new\.zip: is an archive; unpack it"):
+            ask(tmp_path / "new.zip")
+
+
+def test_new_panoramas_are_told_from_raw_circles(tmp_path, rng):
+    """Those of the map's size are its camera's; others of 2 to 1 may be two fisheye circles."""
+    picture(tmp_path / "a.png", 400, 200, rng)
+    circles = np.zeros((300, 600), np.uint8)
+    for column in (150, 450):
+        cv2.circle(circles, (column, 150), 149, 200, -1)
+    cv2.imwrite(str(tmp_path / "raw.png"), circles)
+    mapped = Photographs((View("m.png", Equirectangular(400, 200), tmp_path / "m.png"),), (), {})
+    found, remarks = new_images_of(tmp_path, mapped)
+    assert found.views is not None and [view.name for view in found.views] == ["a.png"]
+    assert "two fisheye circles side by side and no panorama: raw.png" in remarks[0]
+    assert new_images_of(tmp_path, mapped, panorama=True) == (NewImages(tmp_path, None), ())
+
+
+def test_new_images_with_a_calibration_tell_nothing_of_the_lens_of_the_map(tmp_path, rng):
+    """Another camera may make images of the same size."""
+    picture(tmp_path / "a.png", 400, 300, rng)
+    assert not _calibrated(tmp_path, (400, 300))
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 400 300 350 350 200 150\n")
+    assert _calibrated(tmp_path, (400, 300)) and not _calibrated(tmp_path, (300, 400))
 
 
 def test_names_of_images_at_one_place_stand_under_each_other() -> None:
