@@ -328,6 +328,25 @@ def test_an_alarm_rings_once_and_a_request_puts_it_off() -> None:
     assert calls == [True, False, True, False]
 
 
+def test_what_is_put_off_again_and_again_is_done_once_and_wakes_nobody() -> None:
+    calls: list[bool] = []
+    worker = LatestWorker("test", lambda asked: calls.append(asked))
+    worker.start()
+    worker.after(1000.0)
+    until(lambda: worker._sleeps_until_s is not None)
+    first = worker._sleeps_until_s
+    for _ in range(100):
+        worker.after(2000.0)
+    assert worker._sleeps_until_s == first and not calls
+    worker.after(0.01)
+    until(lambda: calls == [False])
+    worker.ask()
+    until(lambda: calls == [False, True])
+    worker.close()
+    worker.join(LIMIT_S)
+    assert calls == [False, True]
+
+
 def test_close_ends_a_waiting_thread() -> None:
     workers = [LatestWorker("test", lambda asked: 1000.0) for _ in range(3)]
     for worker in workers:

@@ -113,7 +113,7 @@ class Session:
     def start(self) -> None:
         """Solve and show the first problem, or the recorded run that was asked for; where the page was opened by a
         link, nothing before the page has told that."""
-        self._client.camera.on_update(lambda camera: self._viewer.ask())
+        self._client.camera.on_update(lambda camera: self._viewer.after(VIEWER_STILL_S))
         for worker in (self._page, self._viewer, self._diagnoser, self._pictures, self._controls.slow, self._solver):
             worker.start()
         first = self._services.first
@@ -465,33 +465,27 @@ class Session:
         self._link.arrived = followed
         if self._link.in_lesson:
             self._link.write(run)
-        self._viewer.ask()
+        self._viewer.after(VIEWER_STILL_S)
         if diagnosis is None:
-            self._diagnoser.ask()
+            self._diagnoser.after(DIAGNOSE_AFTER_S)
         self._due_s = math.inf if pause is None else time.monotonic() + pause
         return PREPARE_AFTER_S if pause is None else min(pause, PREPARE_AFTER_S)
 
-    def _follow_viewer(self, asked: bool) -> float | None:
-        """The viewer thread's job: once the viewer stands still, write its place into the address."""
+    def _follow_viewer(self, asked: bool) -> None:
+        """The viewer thread's job, for when the viewer stands still: write its place into the address."""
         run = self._run
-        if asked:
-            return VIEWER_STILL_S
         if run is not None and self._display.step_key:
             self._link.write(run)
-        return None
 
-    def _examine(self, asked: bool) -> float | None:
-        """The diagnosis thread's job: once nothing has changed for a while, diagnose the newest run and show it."""
+    def _examine(self, asked: bool) -> None:
+        """The diagnosis thread's job, for when nothing has changed for a while: diagnose the newest run and show it."""
         run = self._run
         if run is None or self._diagnosis(run) is not None:
-            return None
-        if asked:
-            return DIAGNOSE_AFTER_S
+            return
         judge(run.trace)
         self._diagnosed = run.trace, diagnose(run.trace)
         self._services.presented.diagnose(*self._diagnosed)
         self._page.ask()
-        return None
 
     def _guarded(self, job: Job) -> Job:
         """The job, with its errors shown as sentences; it knows the changes that were made before it begins."""

@@ -25,6 +25,10 @@ class LatestWorker:
         self._wake = threading.Condition()
         self._asked = False
         self._closed = False
+        self._alarm_s: float | None = None
+        """When the timer runs out."""
+        self._sleeps_until_s: float | None = None
+        """When the thread wakes, whatever the timer says; None if it does not wait or waits for ever."""
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
 
     def start(self) -> None:
@@ -37,6 +41,16 @@ class LatestWorker:
             self._asked = True
             self._wake.notify()
 
+    def after(self, pause_s: float) -> None:
+        """Set the timer, in place of what it was set to. Never waits.
+
+        The thread is woken only if it would sleep longer: who puts a job off again and again disturbs nobody.
+        """
+        with self._wake:
+            self._alarm_s = time.monotonic() + pause_s
+            if self._sleeps_until_s is None or self._alarm_s < self._sleeps_until_s:
+                self._wake.notify()
+
     def close(self) -> None:
         """End the thread after the call that it is in; does not wait for it."""
         with self._wake:
@@ -48,16 +62,23 @@ class LatestWorker:
         self._thread.join(timeout_s)
 
     def _work(self) -> None:
-        alarm: float | None = None
         while True:
             with self._wake:
-                left = None if alarm is None else max(0.0, alarm - time.monotonic())
-                self._wake.wait_for(lambda: self._asked or self._closed, left)
+                while not (self._asked or self._closed or self._left_s() == 0.0):
+                    self._sleeps_until_s = self._alarm_s
+                    self._wake.wait(self._left_s())
+                self._sleeps_until_s = None
                 if self._closed:
                     return
-                asked, self._asked = self._asked, False
-            pause = self._job(asked)
-            alarm = None if pause is None else time.monotonic() + pause
+                asked, self._asked, self._alarm_s = self._asked, False, None
+            pause_s = self._job(asked)
+            with self._wake:
+                if pause_s is not None and self._alarm_s is None:  # else it was set meanwhile
+                    self._alarm_s = time.monotonic() + pause_s
+
+    def _left_s(self) -> float | None:
+        """Seconds until the timer runs out; None if it is not set."""
+        return None if self._alarm_s is None else max(0.0, self._alarm_s - time.monotonic())
 
 
 log = logging.getLogger(__name__)

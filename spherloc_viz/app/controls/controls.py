@@ -459,7 +459,7 @@ class SlowRun:
         with self._lock:
             self._watch, self._stopped, self._lasting = Watch(), False, lasting
             watch = self._watch
-        self._clock.ask()
+        self._clock.after(AFTER_S)
         return watch
 
     def end(self) -> None:
