@@ -39,10 +39,13 @@ MAX_CORRESPONDENCES = 200_000
 """Some ten seconds and 1 GB."""
 MAX_FOR_PAIRS = 200
 """Correspondences up to which pairs are compared first: they decide in milliseconds where most matches are wrong."""
-FEW_INLIERS, MAX_FOR_FEW = 0.04, 3000
-"""Share of inliers below which pairs come first for up to so many correspondences."""
+FEW_INLIERS, FEW_TIMES_ALL = 70, 65_000
+"""Of more correspondences pairs come first where the best known pose explains so few, and few times all is no more:
+there they are faster (measured for 300 to 3000 correspondences)."""
 SEED_SAMPLES = 20_000
 """Most samples of the 2P-RANSAC that finds the first lower bound: enough at 1.5 % inliers, and some milliseconds."""
+PAIR_SAMPLES, MAX_FOR_PAIR_SAMPLES = 500, 1000
+"""Most samples where so many correspondences or fewer have an exact gravity: they miss what pairs find as fast."""
 MIN_SAMPLES = 100
 SEED_CONFIDENCE = 0.99
 FIRST_STARTS = 3
@@ -101,7 +104,9 @@ class ExactMaximumConsensus:
                 f"mc-exact takes up to {MAX_CORRESPONDENCES:,} correspondences, not {count:,}; thin them or use "
                 "ransac-2p."
             )
-        samples = max(MIN_SAMPLES, round(min(1.0, options.effort) * SEED_SAMPLES))
+        is_quick = aligned.gravity_bound_rad == 0.0 and count <= MAX_FOR_PAIR_SAMPLES
+        most = PAIR_SAMPLES if is_quick else SEED_SAMPLES
+        samples = max(MIN_SAMPLES, round(min(1.0, options.effort) * most))
         with clock.stage("guess", until=0.1):
             guess = search_two_point(
                 aligned, bounds.pixels, seed, samples, SEED_CONFIDENCE, local_optimization=True, watch=clock.watch
@@ -156,7 +161,7 @@ def _search(
     """Pairs where they are faster, then positions unless all is proven."""
     deadline = working_s() + options.time_budget_s
     count, known = len(aligned.bearings), 1 if start is None else start[1]
-    few = known <= FEW_INLIERS * count and count <= MAX_FOR_FEW
+    few = known <= FEW_INLIERS and known * count <= FEW_TIMES_ALL
     pairs, effort, yaw_bound = None, 0, None
     if aligned.gravity_bound_rad == 0.0 and (count <= MAX_FOR_PAIRS or few):
         pairs = exact_consensus(
