@@ -60,6 +60,8 @@ draws = "uniform"                 # optional: of coordinates, in the cube; or "n
 
 MAX_CORRESPONDENCES = 10_000
 MAX_GRAVITY_ERROR_DEG = 10.0
+GEOMETRY, NOISE, CHOICE, WRONG, TILT, SECOND, AHEAD = range(7)
+"""Random streams, so that one setting does not change what another one draws."""
 GRAVITY_BOUND_SD = 3.0
 """The bound on gravity, in standard deviations. Errors beyond it (1.1 %) are drawn again, so that the bound is true."""
 LIMITS: Mapping[str, tuple[float, float]] = {
@@ -148,11 +150,11 @@ class SyntheticScene:
         """
         if seed is not None and seed != self.seed:
             return replace(self, seed=seed).problem()
-        streams = [np.random.default_rng([self.seed, stream]) for stream in range(7)]
-        geometry, noise, choice, wrong, tilt, second, ahead = streams
+        geometry, noise, choice, ahead = map(self._rng, (GEOMETRY, NOISE, CHOICE, AHEAD))
         drawn, lens = random_poses(geometry, 1, self.draws)[0], Lens(self.camera, self.field_of_view_deg)
         truth = drawn if self.true_camera is None else _placed(self.true_camera)
-        other = second_pose(second, truth, self.field_of_view_deg) if self.outlier_kind == "coherent" else None
+        is_coherent = self.outlier_kind == "coherent"
+        other = second_pose(self._rng(SECOND), truth, self.field_of_view_deg) if is_coherent else None
         poses = [truth] if other is None else [truth, other]
         cloud = Cloud(self.name, float(camera_centre(drawn)[1]), self.cloud_height_m, self.draws)
         points, shift = cloud.seen_from((geometry, noise, ahead), self.correspondences, lens, drawn, poses)
@@ -162,16 +164,16 @@ class SyntheticScene:
         if other is not None:
             pixels[outliers] = self._noisy_pixels(lens, other, points, shift)[outliers]
         elif self.outlier_kind == "repeated":
-            points[outliers] = copies(second, lens, truth, points)[outliers]
+            points[outliers] = copies(self._rng(SECOND), lens, truth, points)[outliers]
         else:
-            pixels[outliers] = random_pixels(wrong, lens, points, self.name, self.draws)[outliers]
+            pixels[outliers] = random_pixels(self._rng(WRONG), lens, points, self.name, self.draws)[outliers]
         gravity_sd_rad = float(np.radians(self.gravity_error_deg))
         return Problem(
             name=self.name,
             camera=self.camera,
             pixels=pixels,
             points=points,
-            gravity_camera=_tilted_down(tilt, gravity_sd_rad),
+            gravity_camera=_tilted_down(self._rng(TILT), gravity_sd_rad) if gravity_sd_rad else DOWN,
             gravity_map=DOWN,
             gravity_bound_rad=GRAVITY_BOUND_SD * gravity_sd_rad,
             gravity_sd_rad=gravity_sd_rad or None,
@@ -180,6 +182,10 @@ class SyntheticScene:
             truth_inliers=~outliers,
             scene=self._description(),
         )
+
+    def _rng(self, stream: int) -> np.random.Generator:
+        """The random numbers of one of the streams of the seed."""
+        return np.random.default_rng([self.seed, stream])
 
     def _description(self) -> str:
         """The settings of a problem in one line."""
