@@ -236,8 +236,9 @@ def _clique(view: RunView, balls: BallSet) -> Frame:
     )
     largest = "the largest such set" if stage.proven else "the largest set found before the search reached its limit"
     return Frame(
-        f"{len(stage.clique):,} of {len(balls):,} balls overlap pairwise, from {found} matches: "
-        f"{largest}. The best of its pairs puts the camera at {view.position(start)}.",
+        f"{len(stage.clique):,} of {len(balls):,} balls overlap pairwise, from {found} matches"
+        f"{view.right_ones(np.flatnonzero(members))}: {largest}. The best of its pairs puts the camera at "
+        f"{view.position(start)}.",
         "‖t_k1 − t_k2‖ ≤ r_k1 + r_k2   (Eq. 38)",
         start,
         view.colors(style.UNDECIDED, (members, style.CLIQUE)),
@@ -253,7 +254,8 @@ def _clique(view: RunView, balls: BallSet) -> Frame:
 def _own_yaw(view: RunView, cam_from_map: FloatArray) -> str:
     """A sentence on the yaw of the pose (3, 4) of a pair."""
     yaw_rad = float(yaw_of(cam_from_map[:, :3]))
-    return f"That pair fixes the yaw anew, at {np.degrees(yaw_rad):.2f}°{ring.off_truth(view, yaw_rad)}."
+    at = f"{np.degrees(yaw_rad):.2f}°{ring.off_truth(view, yaw_rad)}"
+    return f"The pose is of that pair alone, with a yaw of {at}; the refinement fits all inliers."
 
 
 def _clique_name(balls: BallSet) -> Label:

@@ -62,8 +62,8 @@ def _pair(view: RunView, arcs: StageArcs) -> Frame:
     items = _items(view, arcs, example, (first, second))
     return Frame(
         f"Matches {first} and {second} can both be right only where the line between their points turns into the plane "
-        f"of their bearings, and that fixes the yaw. With {view.trace.options.bound_px:.3g} px of noise it is an arc "
-        f"of {hi - lo:.2g}°, from {lo:.2f}° to {hi:.2f}°{also}.",
+        "of their bearings, and that fixes the yaw. With errors up to the bound, "
+        f"{view.trace.options.bound_px:.3g} px, it is an arc of {hi - lo:.2g}°, from {lo:.2f}° to {hi:.2f}°{also}.",
         f"{true_minus(f'{d1:.3g}')} cos θ {_signed(d2)} sin θ {_signed(d3)} = 0   (Eq. 22)",
         *_shown(view, (first, second), 0.5 * float(stage.lo_rad[k] + stage.hi_rad[k])),
         note=stage.rule,

@@ -156,13 +156,18 @@ class Canvas:
         self._follow_page()
 
     def viewpoint(self) -> tuple[float, ...]:
-        """The viewer's position (3), target (3), and field of view, degrees; empty if it is the default view of the
-        step."""
-        held, looked = self._held, self._looked
+        """The viewer's position (3), target (3), and field of view, degrees; empty if it is the view that the step has
+        by itself, where a page begins there."""
+        held, looked, picture = self._held, self._looked, self._picture
         if held is not None and (looked is None or views.stands_at(self._client, held[1])):
             view = held[1]
-        elif looked is None or (looked[0] is None and self._untouched()) or views.stands_at(self._client, views.START):
+        elif looked is None or picture is None or views.stands_at(self._client, views.START):
             return ()
+        elif looked[0] is None and self._untouched():
+            # While a slider changes the step, its view is kept for as long as the subject is in it.
+            view = looked[1]
+            if views.same(view, views.follow(picture, self._aspect(), self._walls, self._letter())):
+                return ()
         else:
             camera = self._client.camera
             view = views.Viewpoint(np.array(camera.position), np.array(camera.look_at), float(camera.fov))
