@@ -76,6 +76,30 @@ def test_a_page_that_arrives_late_sees_around_walls_that_came_meanwhile(
     assert walls.blocked(there, subject) > 0.5 and walls.blocked(placed("position")[1], subject) < 0.2
 
 
+def test_a_view_that_was_kept_while_a_slider_moved_is_part_of_the_link(
+    page: ConnectedPage, scene_of: Callable[..., SyntheticScene]
+) -> None:
+    """A page that opens the link would put its viewer elsewhere by itself."""
+    shown = Canvas(
+        page.handle, DisplayControls(page.handle.gui, print), lambda *_: None, lambda _: None, lambda *_: None, 0
+    )
+    for noise_px in (1.0, 1.1):
+        problem = scene_of("panorama", correspondences=40, outlier_rate=0.3, noise_px=noise_px).problem()
+        request = RunRequest(SceneRequest("scene", 0), "mc", default_options("mc", problem))
+        run = Run(request, estimate(problem, "mc"), np.arange(len(problem)))
+        index = next(k for k, step in enumerate(steps(run.trace)) if step.key == "clique")
+        shown.draw(run, paint(run.trace, index), None, False)
+        looked = shown._looked
+        assert looked is not None
+        there = {"position": looked[1].position.tolist(), "look_at": looked[1].target.tolist()}
+        page.send(HELLO | there | {"fov": float(looked[1].field_of_view_rad)})
+        until(lambda looked=looked: views.stands_at(page.handle, looked[1]))
+        told = shown.viewpoint()
+        if noise_px == 1.0:
+            assert told == ()
+    np.testing.assert_allclose(told[:6], [*looked[1].position, *looked[1].target])
+
+
 def test_what_is_hidden_is_right_for_where_the_viewer_stands_at_last(
     page: ConnectedPage, scene_of: Callable[..., SyntheticScene]
 ) -> None:
