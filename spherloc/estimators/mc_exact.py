@@ -39,9 +39,9 @@ MAX_CORRESPONDENCES = 200_000
 """Some ten seconds and 1 GB."""
 MAX_FOR_PAIRS = 200
 """Correspondences up to which pairs are compared first: they decide in milliseconds where most matches are wrong."""
-FEW_INLIERS, FEW_TIMES_ALL = 70, 65_000
+FEW_INLIERS, FEW_TIMES_ALL = 35, 65_000
 """Of more correspondences pairs come first where the best known pose explains so few, and few times all is no more:
-there they are faster (measured for 300 to 3000 correspondences)."""
+there they are faster by far, and with more they would be slow where the noise is large (measured for 250 to 3000)."""
 SEED_SAMPLES = 20_000
 """Most samples of the 2P-RANSAC that finds the first lower bound: enough at 1.5 % inliers, and some milliseconds."""
 PAIR_SAMPLES, MAX_FOR_PAIR_SAMPLES = 500, 1000
