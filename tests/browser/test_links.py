@@ -78,7 +78,7 @@ def test_a_reload_and_a_link_bring_back_what_is_shown(
     tab.page.reload()
     tab.expect_card(7)
     expect(tab.value("estimator")).to_have_text("ransac-2p")
-    assert shown(tab) == before and tab.page.url == link
+    assert tab.still(lambda: (shown(tab), tab.page.url), "the page stays") == (before, link)
     for name in ("Matches", "Sweep"):
         expect(tab.page.get_by_role("tab", name=name)).to_have_attribute("aria-selected", "true")
     expect(sorted_by).to_have_text("px ▴")
@@ -94,6 +94,7 @@ def test_a_reload_and_a_link_bring_back_what_is_shown(
     expect(other.page).to_have_url(re.compile(wanted + "&theme=light&table=all%2Cpx$"))
     said = other.page.get_by_text(re.compile("The link is of version '2'.* says 'colour', which this version"))
     expect(said.first).to_be_visible()
+    assert tab.page.url == link, "also long after the reload"
     for page in (tab, other):
         page.expect_quiet(address)
 

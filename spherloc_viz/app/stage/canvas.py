@@ -164,9 +164,10 @@ class Canvas:
         elif looked is None or picture is None or views.stands_at(self._client, views.START):
             return ()
         elif looked[0] is None and self._untouched():
-            # While a slider changes the step, its view is kept for as long as the subject is in it.
-            view = looked[1]
-            if views.same(view, views.follow(picture, self._aspect(), self._walls, self._letter())):
+            # While a slider changes the step, its view is kept for as long as the subject is in it. A canvas that is
+            # hardly reshaped keeps it too, though it is not quite the view of the new shape.
+            _, view, aspect, letter = looked
+            if views.same(view, views.follow(picture, aspect, self._walls, letter)):
                 return ()
         else:
             camera = self._client.camera
