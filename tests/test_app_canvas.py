@@ -104,6 +104,34 @@ def test_a_view_that_was_kept_while_a_slider_moved_is_part_of_the_link(
     np.testing.assert_allclose(told[:6], [*looked[1].position, *looked[1].target])
 
 
+def test_a_view_that_a_link_asked_for_stays_in_the_link_while_a_page_is_built(
+    page: ConnectedPage, scene_of: Callable[..., SyntheticScene]
+) -> None:
+    """Such a page reports that its viewer has not moved; a reload at that time must not lose the view."""
+    shown = Canvas(
+        page.handle, DisplayControls(page.handle.gui, print), lambda *_: None, lambda _: None, lambda *_: None, 0
+    )
+    problem = scene_of("panorama", correspondences=40, outlier_rate=0.3).problem()
+    request = RunRequest(SceneRequest("scene", 0), "mc", default_options("mc", problem))
+    run = Run(request, estimate(problem, "mc"), np.arange(len(problem)))
+    picture = paint(run.trace, 0)
+    asked = (1.0, -2.0, -5.0, 0.0, 0.0, 0.0, 45.0)
+    shown.hold(picture.step.key, asked)
+    assert shown.viewpoint() == asked
+
+    def stand(position: tuple[float, ...]) -> None:
+        page.send(HELLO | {"position": position, "look_at": asked[3:6], "fov": float(np.radians(asked[6]))})
+        until(lambda: np.allclose(page.handle.camera.position, position))
+
+    stand(views.START)
+    shown.draw(run, picture, None, False)
+    assert shown.viewpoint() == asked
+    stand(asked[:3])
+    assert shown.viewpoint() == asked
+    stand((2.0, -2.0, -5.0))
+    assert shown.viewpoint()[:3] == (2.0, -2.0, -5.0)
+
+
 def test_what_is_hidden_is_right_for_where_the_viewer_stands_at_last(
     page: ConnectedPage, scene_of: Callable[..., SyntheticScene]
 ) -> None:

@@ -159,9 +159,10 @@ class Canvas:
         """The viewer's position (3), target (3), and field of view, degrees; empty if it is the view that the step has
         by itself, where a page begins there."""
         held, looked, picture = self._held, self._looked, self._picture
-        if held is not None and (looked is None or views.stands_at(self._client, held[1])):
-            view = held[1]
-        elif looked is None or picture is None or views.stands_at(self._client, views.START):
+        at_start = views.stands_at(self._client, views.START)
+        if held is not None and (looked is None or looked[0] != HELD or at_start or self._untouched()):
+            view = held[1]  # also while the page is still being built or on the way there
+        elif looked is None or picture is None or at_start:
             return ()
         elif looked[0] is None and self._untouched():
             # While a slider changes the step, its view is kept for as long as the subject is in it. A canvas that is
