@@ -97,9 +97,9 @@ def test_a_view_that_was_kept_while_a_slider_moved_is_part_of_the_link(
         told = shown.viewpoint()
         if noise_px == 1.0:
             assert told == ()
-            hardly_lower = {"image_height": HELLO["image_height"] - 1}
-            page.send(HELLO | there | {"fov": float(looked[1].field_of_view_rad)} | hardly_lower)
-            until(lambda: page.handle.camera.image_height == hardly_lower["image_height"])
+            lower_px = HELLO["image_height"] - 1
+            page.send(HELLO | there | {"fov": float(looked[1].field_of_view_rad), "image_height": lower_px})
+            until(lambda lower_px=lower_px: page.handle.camera.image_height == lower_px)
             assert shown.viewpoint() == ()
     np.testing.assert_allclose(told[:6], [*looked[1].position, *looked[1].target])
 

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from spherloc.errors import ProblemError
 from spherloc.estimators import default_options, estimate
 from spherloc.frontend.view import Gravity, View
-from spherloc.geometry import DOWN
+from spherloc.geometry import DOWN, transform
 from spherloc.mapping.model import Reconstruction, contradictions, points_of
 from spherloc.mapping.parallel import Tell
+from spherloc.mapping.rig import expected_poses, shots_of
 from spherloc.mapping.upright import Level, arbitrary_scale
 from spherloc.outcome import Outcome, judge
 from spherloc.problem import Problem
@@ -31,6 +32,8 @@ ESTIMATOR = "ransac-2p"
 MIN_INLIERS = 12
 UNKNOWN_BOUND_RAD = float(np.radians(5.0))
 """Bound on the error of gravity in an image without vertical lines, which is assumed to be level."""
+EXPECTED_RAD = float(np.radians(5.0))
+"""How far matches may be from where an expected pose has them."""
 MAX_ROUNDS = 4
 """Largest number of rounds: a localized image adds points, by which others can be localized in the next round."""
 
@@ -57,28 +60,38 @@ def place_rest(
 ) -> Reconstruction:
     """The map with those left-out images whose pose is accepted; those named in ``elsewhere`` are not tried.
 
-    ``gravity`` is that from vertical lines, by the name of the image.
+    ``gravity`` is that from vertical lines, by the name of the image. Where a camera took an image together with one
+    that is in the map, only matches that fit its expected pose are looked at first.
     """
-    names = [view.name for view in views]
+    names, shots = [view.name for view in views], shots_of(views)
     for round_number in count(1):
         left = [view for view in views if view.name not in made.poses and view.name not in elsewhere]
         placed: dict[str, _Placed] = {}
         unit = arbitrary_scale(made.depths()).metres_per_unit
+        expected = expected_poses(made.poses, shots)
         for done, view in enumerate(left, start=1):
-            one = _place(made, view, gravity.get(view.name), level, unit)
+            one = _place(made, view, gravity.get(view.name), level, unit, expected.get(view.name))
             if one is not None and _undoubted(made, names, view.name, one):
                 placed[view.name] = one
             tell(f"left-out images tried, round {round_number}", done, len(left))
         if not placed:
             return made
-        made = _with(made, placed, names)
+        made = _with(made, placed)
         if round_number == MAX_ROUNDS:
             return made
     raise AssertionError  # count has no end
 
 
-def _place(made: Reconstruction, view: View, gravity: Gravity | None, level: Level, unit: float) -> _Placed | None:
-    """The pose of a left-out image; None if it is not accepted."""
+def _place(
+    made: Reconstruction,
+    view: View,
+    gravity: Gravity | None,
+    level: Level,
+    unit: float,
+    expected: FloatArray | None,
+) -> _Placed | None:
+    """The pose of a left-out image, with only the matches near the ``expected`` one (3, 4) if that is known; None if it
+    is not accepted."""
     pycolmap = require("pycolmap", "colmap", "making a map")
     number = made.ids[view.name]
     found = [np.empty((0, 2), np.int64)]
@@ -93,10 +106,15 @@ def _place(made: Reconstruction, view: View, gravity: Gravity | None, level: Lev
             points = point_of[pairs[:, 1]]
             found.append(np.column_stack([pairs[:, 0], points])[points >= 0])
     pairs = np.unique(np.concatenate(found), axis=0)
+    pixels = keypoints[pairs[:, 0]]
+    points = np.array([made.model.point3D(int(index)).xyz for index in pairs[:, 1]]).reshape(-1, 3)
+    if expected is not None:
+        seen_at = transform(expected, points)
+        bearings, seen = view.camera.unproject(pixels)
+        near = seen & (np.sum(bearings * seen_at, axis=1) >= np.cos(EXPECTED_RAD) * np.linalg.norm(seen_at, axis=1))
+        pairs, pixels, points = pairs[near], pixels[near], points[near]
     if len(pairs) < MIN_INLIERS:
         return None
-    pixels = keypoints[pairs[:, 0]]
-    points = np.array([made.model.point3D(int(index)).xyz for index in pairs[:, 1]])
     bound_rad = UNKNOWN_BOUND_RAD if gravity is None or gravity.bound_rad is None else gravity.bound_rad
     try:
         problem = Problem(
@@ -131,7 +149,13 @@ def _undoubted(made: Reconstruction, names: Sequence[str], name: str, placed: _P
     return not any(name in pair for pair in contradictions(poses, names, made.all_matches, points))
 
 
-def _with(made: Reconstruction, placed: Mapping[str, _Placed], names: Sequence[str]) -> Reconstruction:
+def with_images(made: Reconstruction, poses: Mapping[str, FloatArray]) -> Reconstruction:
+    """The map with images of these poses (3, 4) in its frame, after another triangulation and bundle adjustment."""
+    none = np.empty(0, np.int64)
+    return _with(made, {name: _Placed(pose, none, none) for name, pose in poses.items()})
+
+
+def _with(made: Reconstruction, placed: Mapping[str, _Placed]) -> Reconstruction:
     """The map with more images, after another triangulation and bundle adjustment."""
     pycolmap = require("pycolmap", "colmap", "making a map")
     model = made.model

@@ -50,6 +50,8 @@ class Reconstruction:
     """COLMAP's database with features and matches of all images."""
     ids: dict[str, int]
     """Ids of all images in the database, by name."""
+    joined: bool = False
+    """Whether maps of single cameras were joined by the images that these took together (``rig``)."""
 
     def without(self, names: Collection[str]) -> "Reconstruction":
         """The model without the images ``names``, and without points that fewer than two of the other images see."""

@@ -5,7 +5,8 @@ not only a homography: a full sphere sees more than one plane, and matches that 
 poster or a floor that looks the same elsewhere.
 
 Where places look alike, a map may take two for one (see ``model``). A second map is made from the strong pairs alone,
-and the one with more images in all its parts, minus a penalty for contradictions, is taken.
+and the one with more images in all its parts, minus a penalty for contradictions, is taken. Where cameras took images
+together, maps of each by itself are a third candidate, joined by these images (see ``rig``).
 """
 
 import ctypes
@@ -15,6 +16,7 @@ import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,12 +34,15 @@ from spherloc.frontend.features import VERSION, Features, extract
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
+from spherloc.mapping.later import with_images
 from spherloc.mapping.misplaced import without_misplaced
 from spherloc.mapping.model import Reconstruction, parted, registered, untangled, worth
 from spherloc.mapping.pairs import MIN_MATCHES, ImagePairs, relative
 from spherloc.mapping.parallel import Tell, as_completed
+from spherloc.mapping.rig import Shots, joined_poses, lies_apart, one_camera, shots_of, with_ties
 from spherloc.mapping.rotations import agreeing
 from spherloc.mapping.triangles import Pair, open_triangles
+from spherloc.mapping.upright import level_of
 from spherloc.registry import require
 from spherloc.types import BoolArray, FloatArray
 
@@ -129,8 +134,20 @@ def reconstruct(
     names = [view.name for view in views]
     rotations = {(names[one], names[other]): relative(geometry)[0] for (one, other), geometry in agreed.items()}
     number_of = dict(zip(names, ids, strict=True))
-    made = [_models_of(pycolmap, whole, number_of, rotations, counts, same_place, keep, tell) for keep in (0.0, STRONG)]
+    shots, made, rigid = shots_of(views), list[tuple[Reconstruction, ...]](), ()
+    if shots:
+        known = {name: one for name, one in zip(names, gravity, strict=True) if one is not None}
+        tied = with_ties(counts + same_place, names, shots)
+        own = counts * one_camera(names, shots)
+        models = _models_of(pycolmap, whole, number_of, rotations, own, same_place, 0.0, tell)
+        if rigid := _joined(models, shots, known, counts, tied):
+            made, same_place = [rigid], tied - counts
+    made += [
+        _models_of(pycolmap, whole, number_of, rotations, counts, same_place, keep, tell) for keep in (0.0, STRONG)
+    ]
     candidates = [models for models in made if models]
+    if rigid:
+        candidates = [models for models in candidates if not any(lies_apart(one.poses, shots) for one in models)]
     if not candidates:
         raise InputError(
             f"COLMAP could not start a map from these {len(views)} photographs, although pairs of them match: they "
@@ -173,6 +190,35 @@ def _models_of(
         if len(whole.poses) > 1:
             found += parted(whole.judged())
     return untangled(found)
+
+
+def _joined(
+    models: Sequence[Reconstruction],
+    shots: Shots,
+    gravity: Mapping[str, Gravity],
+    counts: NDArray[np.int64],
+    tied: NDArray[np.int64],
+) -> tuple[Reconstruction, ...]:
+    """Models of single cameras, joined where these took images together; none if no two are joined.
+
+    ``gravity`` is that of images by name, ``counts`` and ``tied`` (V, V) the numbers of matches of all pairs, the
+    latter with those taken from one place or together.
+    """
+    left = [replace(one, matches=counts, all_matches=tied) for one in models]
+    joined: list[Reconstruction] = []
+    while left:
+        whole = left.pop(0)
+        for other in list(left):
+            try:
+                downs = level_of(whole.poses, gravity).down, level_of(other.poses, gravity).down
+            except InputError:  # its images do not agree on where down is
+                continue
+            poses = joined_poses(whole.poses, other.poses, downs, shots)
+            if more := {name: pose for name, pose in poses.items() if name not in whole.poses}:
+                whole = replace(with_images(whole, more), joined=True)
+                left.remove(other)
+        joined.append(whole)
+    return untangled(joined) if len(joined) < len(models) else ()
 
 
 @contextmanager

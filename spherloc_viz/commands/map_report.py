@@ -20,6 +20,7 @@ from spherloc.mapping.line_gravity import LEANING_DEG, share_below
 from spherloc.mapping.make import Map
 from spherloc.mapping.pairs import MIN_MATCHES
 from spherloc.mapping.photographs import Photographs, cameras_of
+from spherloc.mapping.rig import shots_of, words
 from spherloc.types import FloatArray
 
 MAP_FEATURES = {
@@ -42,6 +43,7 @@ def summary(made: Map, found: Photographs) -> list[str]:
     lines = [
         f"in the map    {len(written.poses)} of {len(found.views)} images, {len(written.points):,} points, "
         f"{written.error_px:.2f} px mean error",
+        *(f"joined        {said}" for said in _joined_words(made, found)),
         f"down          {_down(made)}",
         *_about_lines(made),
         f"features      {about_features(made)}",
@@ -63,6 +65,8 @@ def summary(made: Map, found: Photographs) -> list[str]:
         lines.append(f"left out      {', '.join(missing[:5])}{', …' if len(missing) > 5 else ''}: see the report")
     for group in made.groups:
         lines.append(f"on its own    {len(group.written.poses)} images that could not be joined: {group.written.scene}")
+    if made.opposed:
+        lines.append(f"in doubt      {_opposed_words(*made.opposed)}")
     if made.made.contradictions:
         first, second = made.made.contradictions[0]
         lines.append(
@@ -72,6 +76,18 @@ def summary(made: Map, found: Photographs) -> list[str]:
     if far := made.scale.misplaced:
         lines.append(f"in doubt      {_far_words(far)}")
     return lines
+
+
+def _joined_words(made: Map, found: Photographs) -> list[str]:
+    """Which maps of single cameras were joined; none if they were not."""
+    return [words(made.written.poses, shots_of(found.views))] if made.made.joined else []
+
+
+def _opposed_words(first: str, second: str) -> str:
+    return (
+        f"{first} and {second} took images together, but went different ways in their maps: if they are fixed to each "
+        "other, one of the maps is wrong"
+    )
 
 
 def about_features(made: Map) -> str:
@@ -146,6 +162,7 @@ def map_report(made: Map, found: Photographs) -> str:
         "Images in the map": f"{len(written.poses)} of {len(views)}",
         "Points": f"{len(written.points):,}",
         "Mean reprojection error": f"{written.error_px:.2f} px",
+        **({"Joined": joined} if (joined := "; ".join(_joined_words(made, found))) else {}),
         "Down": _down(made),
         "Features": MAP_FEATURES[made.features],
         **({"Masked": _carried_words(made.carried_deg)} if made.carried_deg else {}),
@@ -179,6 +196,8 @@ def map_report(made: Map, found: Photographs) -> str:
 def _doubts(made: Map) -> list[str]:
     against, far = made.made.contradictions, made.scale.misplaced
     said = [f'<p class="out">Images {html.escape(_far_words(far))}.</p>'] if far else []
+    if made.opposed:
+        said.append(f'<p class="out">In doubt: {html.escape(_opposed_words(*made.opposed))}.</p>')
     if not against:
         return said
     pairs = "; ".join(f"{first} and {second}" for first, second in against[:10])

@@ -1,0 +1,282 @@
+"""Cameras that are fixed to each other: which images they took together, and maps that are joined by these.
+
+Cameras that look to different sides hardly see the same things at the same time. What ties their images are matches of
+later images, or wrong ones between places that look alike, so that a map of all may put one camera's images far from
+those of the others. But all cameras go the same way: where the map of each camera by itself has the images that were
+taken together, a similarity transform takes the way of one to that of the other.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from pathlib import PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.datasets.imu import time_in_name
+from spherloc.frontend.view import View
+from spherloc.geometry import align_to_down, camera_centre, pose, rotation_angle, yaw_rotation
+from spherloc.types import BoolArray, FloatArray
+
+MIN_TOGETHER = 5
+"""Least number of images that two cameras took together."""
+SHARE_TOGETHER = 0.8
+"""Least share of such images among those of the camera that has fewer."""
+NEAR_IN_TIME = 0.25
+"""Two images were taken together if their times differ by no more than this share of the time to the next image."""
+MIN_FITTING = 0.6
+"""Least share of the images taken together that a transform between two maps must fit."""
+OFF, TURNED_RAD = 0.3, float(np.radians(5.0))
+"""A pair of images taken together fits if it is no farther apart than this share of a step of the way, and if one
+camera is turned against the other as in other pairs."""
+MIN_WAY = 3.0
+"""Least extent, in steps, of the way on which they fit."""
+APART = 1.0
+"""In a map that is wrong, images taken together are farther from each other than this many steps (median), and not as
+two fixed cameras are."""
+
+Shots = Mapping[str, tuple[str, int]]
+"""By an image's name: its camera's name, and a number that all images taken together with it have."""
+
+_NUMBERS = re.compile(r"\d+(?:\.\d+)?")
+
+
+def shots_of(views: Sequence[View]) -> Shots:
+    """Camera and time step of the images of cameras that took most of their images together, as names and times in them
+    say; none if there are no two such cameras. A panorama sees all around and is left out."""
+    keys: dict[str, dict[str, float]] = {}
+    for view in views:
+        if not isinstance(view.camera, Equirectangular) and (named := _camera_and_key(view.name)):
+            keys.setdefault(named[0], {})[view.name] = named[1]
+    keys = {camera: images for camera, images in keys.items() if len(images) >= MIN_TOGETHER}
+    if len(keys) < 2:
+        return {}
+    reference = max(keys, key=lambda camera: len(keys[camera]))
+    steps = np.unique(list(keys[reference].values()))
+    room = NEAR_IN_TIME * float(np.median(np.diff(steps)))
+    found: dict[str, tuple[str, int]] = {}
+    for camera, images in keys.items():
+        nearest = {name: int(np.argmin(np.abs(steps - key))) for name, key in images.items()}
+        together = {name: step for name, step in nearest.items() if abs(steps[step] - images[name]) <= room}
+        if len(set(together.values())) >= max(MIN_TOGETHER, SHARE_TOGETHER * min(len(images), len(steps))):
+            found.update({name: (camera, step) for name, step in together.items()})
+    return found if len({camera for camera, _ in found.values()}) > 1 else {}
+
+
+def _camera_and_key(name: str) -> tuple[str, float] | None:
+    """The camera that a name tells, its folder or what is left of it without its longest number, and that number or
+    the time that it is; None without a number."""
+    path = PurePosixPath(name)
+    numbers = list(_NUMBERS.finditer(path.stem))
+    if not numbers:
+        return None
+    key = max(numbers, key=lambda number: (len(number[0]), number.start()))
+    time_ns = time_in_name(name)
+    folder = "" if path.parent == PurePosixPath(".") else str(path.parent)
+    camera = folder or path.stem[: key.start()] + path.stem[key.end() :]
+    return camera, float(key[0]) if time_ns is None else float(time_ns)
+
+
+def lies_apart(poses: Mapping[str, FloatArray], shots: Shots) -> bool:
+    """Whether two cameras that took images together went different ways in a map of ``poses`` (3, 4)."""
+    for first, second in combinations(sorted({camera for camera, _ in shots.values()}), 2):
+        one, other = _together(poses, poses, shots, (first, second))
+        if len(one) >= MIN_TOGETHER:
+            here = _centres(one)
+            apart = np.linalg.norm(here - _centres(other), axis=1)
+            if np.median(apart) > APART * _step(here) and _relative(one, other) is None:
+                return True
+    return False
+
+
+def joined_poses(
+    poses: Mapping[str, FloatArray],
+    others: Mapping[str, FloatArray],
+    downs: tuple[FloatArray, FloatArray],
+    shots: Shots,
+) -> dict[str, FloatArray]:
+    """Poses (3, 4) of the images of another map in the frame of the first, but for those that do not fit.
+
+    ``poses`` and ``others`` (3, 4) are those of both maps by name, ``downs`` (3,) gravity in either. Empty if no images
+    taken together show how the two lie to each other.
+    """
+    cameras = [sorted({shots[name][0] for name in one if name in shots}) for one in (poses, others)]
+    best: tuple[int, dict[str, FloatArray]] = (0, {})
+    to_level, other_to_level = (align_to_down(down) for down in downs)
+    for first in cameras[0]:
+        for second in cameras[1]:
+            if first == second:
+                continue
+            one, other = _together(poses, others, shots, (first, second))
+            if len(one) < MIN_TOGETHER:
+                continue
+            fit = _fit(one @ _turned(to_level), other @ _turned(other_to_level))
+            if fit is None or fit[3].sum() <= best[0]:
+                continue
+            scale, turn, shift, fits = fit
+            steps = sorted(_steps(poses, shots, first).keys() & _steps(others, shots, second).keys())
+            wrong = {steps[k] for k in np.flatnonzero(~fits).tolist()}
+            moved = {}
+            for name, there in others.items():
+                if name in shots and shots[name][0] == second and shots[name][1] in wrong:
+                    continue
+                rotation = there[:, :3] @ other_to_level.T @ turn.T @ to_level
+                centre = to_level.T @ (scale * turn @ other_to_level @ camera_centre(there) + shift)
+                moved[name] = pose(rotation, -rotation @ centre)
+            best = int(fits.sum()), moved
+    return best[1]
+
+
+def _turned(to_level: FloatArray) -> FloatArray:
+    """What a pose (3, 4) is multiplied by (4, 4) for a map that is turned so."""
+    turn = np.eye(4)
+    turn[:3, :3] = to_level.T
+    return turn
+
+
+def _steps(poses: Mapping[str, FloatArray], shots: Shots, camera: str) -> dict[int, FloatArray]:
+    """Poses (3, 4) of a camera's images by their time step."""
+    return {shots[name][1]: pose for name, pose in poses.items() if name in shots and shots[name][0] == camera}
+
+
+def _together(
+    poses: Mapping[str, FloatArray], others: Mapping[str, FloatArray], shots: Shots, cameras: tuple[str, str]
+) -> tuple[FloatArray, FloatArray]:
+    """Poses (K, 3, 4) of the images that two cameras took together, those of the first and of the second, in the order
+    of time."""
+    here, there = _steps(poses, shots, cameras[0]), _steps(others, shots, cameras[1])
+    both = sorted(here.keys() & there.keys())
+    return tuple(np.array([one[step] for step in both]).reshape(-1, 3, 4) for one in (here, there))  # pyright: ignore
+
+
+def _centres(poses: FloatArray) -> FloatArray:
+    """Camera centres (K, 3) of poses (K, 3, 4)."""
+    return -np.einsum("kij,ki->kj", poses[:, :, :3], poses[:, :, 3])
+
+
+def _step(centres: FloatArray) -> float:
+    """Median distance between centres (K, 3) that follow each other."""
+    return float(np.median(np.linalg.norm(np.diff(centres, axis=0), axis=1)))
+
+
+def _fit(one: FloatArray, other: FloatArray) -> tuple[float, FloatArray, FloatArray, BoolArray] | None:
+    """Scale, rotation (3, 3) about the vertical and translation (3,) of a level map to another, from poses (K, 3, 4) in
+    both of images that were taken together, and which of these fit (K,); None if too few do.
+
+    All pairs of images are tried, each of which fixes a transform: the distance the scale, the direction the yaw.
+    """
+    here, there = _centres(one), _centres(other)
+    step = _step(here)
+    if step == 0.0:
+        return None
+    best: tuple[int, float, tuple[float, FloatArray, FloatArray, BoolArray]] | None = None
+    for i, j in combinations(range(len(here)), 2):
+        way, other_way = here[j] - here[i], there[j] - there[i]
+        if min(np.hypot(*way[[0, 2]]) / step, np.linalg.norm(other_way)) < 1e-6:
+            continue
+        scale = float(np.linalg.norm(way) / np.linalg.norm(other_way))
+        turn = yaw_rotation(np.arctan2(way[0], way[2]) - np.arctan2(other_way[0], other_way[2]))
+        shift = 0.5 * (here[i] + here[j] - scale * (there[i] + there[j]) @ turn.T)
+        off = np.linalg.norm(scale * there @ turn.T + shift - here, axis=1) / step
+        fits = (off <= OFF) & _turned_alike(one, other @ _turned(turn), i)
+        score = int(fits.sum()), -float(off[fits].sum())
+        if best is None or score > best[:2]:
+            best = (*score, (scale, turn, shift, fits))
+    if best is None or best[0] < max(MIN_TOGETHER, MIN_FITTING * len(here)):
+        return None
+    within = here[best[2][3]]
+    return best[2] if np.linalg.norm(np.ptp(within, axis=0)) >= MIN_WAY * step else None
+
+
+def _turned_alike(one: FloatArray, other: FloatArray, index: int) -> BoolArray:
+    """Whether (K,) cameras of poses (K, 3, 4) are turned against each other as those of one pair are."""
+    between = other[:, :, :3] @ one[:, :, :3].transpose(0, 2, 1)
+    angles = [rotation_angle(turned @ between[index].T) for turned in between]
+    return np.array(angles) <= TURNED_RAD
+
+
+def one_camera(names: Sequence[str], shots: Shots) -> BoolArray:
+    """Whether (V, V) two images are of one camera, as far as it is known which is whose."""
+    cameras = [shots[name][0] if name in shots else "" for name in names]
+    return np.array([[one == other for other in cameras] for one in cameras])
+
+
+def with_ties(counts: NDArray[np.int64], names: Sequence[str], shots: Shots) -> NDArray[np.int64]:
+    """Numbers of matches (V, V), in which images that were taken together have as many as either has with any other, so
+    that they are never told apart for having none."""
+    tied, best = counts.copy(), counts.max(axis=1)
+    for one, other in combinations(range(len(names)), 2):
+        first, second = shots.get(names[one]), shots.get(names[other])
+        if first and second and first[1] == second[1]:
+            tied[one, other] = tied[other, one] = max(best[one], best[other], tied[one, other])
+    return tied
+
+
+def words(poses: Mapping[str, FloatArray], shots: Shots) -> str:
+    """The cameras of a map and how often they took images together: "left and right, which took 14 images together"."""
+    inside = {name: shot for name, shot in shots.items() if name in poses}
+    images = Counter(step for _, step in inside.values())
+    cameras = sorted({camera for camera, _ in inside.values()})
+    count = sum(images_then > 1 for images_then in images.values())
+    return f"{', '.join(cameras[:-1])} and {cameras[-1]}, by {count} times at which they took images together"
+
+
+def expected_poses(poses: Mapping[str, FloatArray], shots: Shots) -> dict[str, FloatArray]:
+    """Poses (3, 4) that images which are not in a map should have, since another camera's that was taken together with
+    each is. How two cameras stand to each other is told by the images of both in the map."""
+    found: dict[str, FloatArray] = {}
+    name_of = {shot: name for name, shot in shots.items()}
+    cameras = sorted({camera for camera, _ in shots.values()})
+    for first in cameras:
+        for second in cameras:
+            one, other = _together(poses, poses, shots, (first, second))
+            if first == second or (relative := _relative(one, other)) is None:
+                continue
+            for step, here in _steps(poses, shots, first).items():
+                name = name_of.get((second, step))
+                if name is not None and name not in poses:
+                    found.setdefault(name, _after(relative, here))
+    return found
+
+
+def _relative(one: FloatArray, other: FloatArray) -> FloatArray | None:
+    """The pose (3, 4) of the second camera from the first that most of their poses (K, 3, 4) agree on; None if too few
+    do."""
+    if len(one) < MIN_TOGETHER or (step := _step(_centres(one))) == 0.0:
+        return None
+    turns = other[:, :, :3] @ one[:, :, :3].transpose(0, 2, 1)
+    shifts = other[:, :, 3] - np.einsum("kij,kj->ki", turns, one[:, :, 3])
+    near = np.linalg.norm(shifts[:, None] - shifts, axis=2) <= OFF * step
+    alike = np.array([[rotation_angle(turn @ base.T) <= TURNED_RAD for turn in turns] for base in turns])
+    best = int(np.argmax((near & alike).sum(axis=1)))
+    fits = near[best] & alike[best]
+    if fits.sum() < max(MIN_TOGETHER, MIN_FITTING * len(one)):
+        return None
+    left, _, right = np.linalg.svd(turns[fits].sum(axis=0))
+    turn = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return pose(turn, np.median(shifts[fits], axis=0))
+
+
+def _after(relative: FloatArray, here: FloatArray) -> FloatArray:
+    """The pose (3, 4) of a camera that stands so to another with the pose ``here`` (3, 4)."""
+    return pose(relative[:, :3] @ here[:, :3], relative[:, :3] @ here[:, 3] + relative[:, 3])
+
+
+def disagree(
+    poses: Mapping[str, FloatArray],
+    others: Mapping[str, FloatArray],
+    downs: tuple[FloatArray, FloatArray],
+    shots: Shots,
+) -> tuple[str, str] | None:
+    """Two cameras that took images together, most of which are in two maps (``joined_poses``), but went different ways
+    there; None if there are none."""
+    if joined_poses(poses, others, downs, shots):
+        return None
+    for pair in combinations(sorted({camera for camera, _ in shots.values()}), 2):
+        for first, second in (pair, pair[::-1]):
+            if len(_together(poses, others, shots, (first, second))[0]) >= MIN_TOGETHER:
+                return pair
+    return None
