@@ -216,7 +216,7 @@ def with_ties(counts: NDArray[np.int64], names: Sequence[str], shots: Shots) -> 
 
 
 def words(poses: Mapping[str, FloatArray], shots: Shots) -> str:
-    """The cameras of a map and how often they took images together: "left and right, which took 14 images together"."""
+    """The cameras of a map of ``poses`` (3, 4), and how often they took images together, in words."""
     inside = {name: shot for name, shot in shots.items() if name in poses}
     images = Counter(step for _, step in inside.values())
     cameras = sorted({camera for camera, _ in inside.values()})
@@ -271,8 +271,10 @@ def disagree(
     downs: tuple[FloatArray, FloatArray],
     shots: Shots,
 ) -> tuple[str, str] | None:
-    """Two cameras that took images together, most of which are in two maps (``joined_poses``), but went different ways
-    there; None if there are none."""
+    """Two cameras that took images together, but went different ways in two maps; None if there are none.
+
+    The parameters are those of ``joined_poses``: ``poses`` and ``others`` (3, 4) by name, ``downs`` (3,).
+    """
     if joined_poses(poses, others, downs, shots):
         return None
     for pair in combinations(sorted({camera for camera, _ in shots.values()}), 2):
