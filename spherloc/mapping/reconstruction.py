@@ -39,7 +39,7 @@ from spherloc.mapping.misplaced import without_misplaced
 from spherloc.mapping.model import Reconstruction, parted, registered, untangled, worth
 from spherloc.mapping.pairs import MIN_MATCHES, ImagePairs, relative
 from spherloc.mapping.parallel import Tell, as_completed
-from spherloc.mapping.rig import Shots, joined_poses, lies_apart, one_camera, shots_of, with_ties
+from spherloc.mapping.rig import Shots, joint_of, lies_apart, one_camera, shots_of, with_ties
 from spherloc.mapping.rotations import agreeing
 from spherloc.mapping.triangles import Pair, open_triangles
 from spherloc.mapping.upright import level_of
@@ -213,9 +213,10 @@ def _joined(
                 downs = level_of(whole.poses, gravity).down, level_of(other.poses, gravity).down
             except InputError:  # its images do not agree on where down is
                 continue
-            poses = joined_poses(whole.poses, other.poses, downs, shots)
-            if more := {name: pose for name, pose in poses.items() if name not in whole.poses}:
-                whole = replace(with_images(whole, more), joined=True)
+            joint = joint_of(whole.poses, other.poses, downs, shots)
+            if joint is not None:
+                more = {name: pose for name, pose in joint.poses.items() if name not in whole.poses}
+                whole = replace(with_images(whole.without(joint.misfits), more), joined=True)
                 left.remove(other)
         joined.append(whole)
     return untangled(joined) if len(joined) < len(models) else ()

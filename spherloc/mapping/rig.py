@@ -9,7 +9,8 @@ taken together, a similarity transform takes the way of one to that of the other
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from itertools import combinations
+from dataclasses import dataclass
+from itertools import combinations, product
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -29,7 +30,7 @@ NEAR_IN_TIME = 0.25
 """Two images were taken together if their times differ by no more than this share of the time to the next image."""
 MIN_FITTING = 0.6
 """Least share of the images taken together that a transform between two maps must fit."""
-OFF, TURNED_RAD = 0.3, float(np.radians(5.0))
+OFF, TURNED_RAD = 0.5, float(np.radians(5.0))
 """A pair of images taken together fits if it is no farther apart than this share of a step of the way, and if one
 camera is turned against the other as in other pairs."""
 MIN_WAY = 3.0
@@ -92,42 +93,48 @@ def lies_apart(poses: Mapping[str, FloatArray], shots: Shots) -> bool:
     return False
 
 
-def joined_poses(
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """How the map of another camera joins a map."""
+
+    poses: dict[str, FloatArray]
+    """Poses (3, 4) of its images in the frame of the map, by name, but for those that do not fit."""
+    misfits: frozenset[str]
+    """Names of images of the map that were taken together with these; one of the two stands elsewhere, and it is not
+    known which."""
+
+
+def joint_of(
     poses: Mapping[str, FloatArray],
     others: Mapping[str, FloatArray],
     downs: tuple[FloatArray, FloatArray],
     shots: Shots,
-) -> dict[str, FloatArray]:
-    """Poses (3, 4) of the images of another map in the frame of the first, but for those that do not fit.
+) -> Joint | None:
+    """How another map joins a map, by the two cameras of which most images fit; None if there are no such cameras.
 
-    ``poses`` and ``others`` (3, 4) are those of both maps by name, ``downs`` (3,) gravity in either. Empty if no images
-    taken together show how the two lie to each other.
+    ``poses`` and ``others`` (3, 4) are those of both maps by name, ``downs`` (3,) gravity in either.
     """
     cameras = [sorted({shots[name][0] for name in one if name in shots}) for one in (poses, others)]
-    best: tuple[int, dict[str, FloatArray]] = (0, {})
+    most, best = 0, None
     to_level, other_to_level = (align_to_down(down) for down in downs)
-    for first in cameras[0]:
-        for second in cameras[1]:
-            if first == second:
-                continue
-            one, other = _together(poses, others, shots, (first, second))
-            if len(one) < MIN_TOGETHER:
-                continue
-            fit = _fit(one @ _turned(to_level), other @ _turned(other_to_level))
-            if fit is None or fit[3].sum() <= best[0]:
-                continue
-            scale, turn, shift, fits = fit
-            steps = sorted(_steps(poses, shots, first).keys() & _steps(others, shots, second).keys())
-            wrong = {steps[k] for k in np.flatnonzero(~fits).tolist()}
-            moved = {}
-            for name, there in others.items():
-                if name in shots and shots[name][0] == second and shots[name][1] in wrong:
-                    continue
-                rotation = there[:, :3] @ other_to_level.T @ turn.T @ to_level
-                centre = to_level.T @ (scale * turn @ other_to_level @ camera_centre(there) + shift)
-                moved[name] = pose(rotation, -rotation @ centre)
-            best = int(fits.sum()), moved
-    return best[1]
+    for first, second in product(*cameras):
+        one, other = _together(poses, others, shots, (first, second))
+        if first == second or len(one) < MIN_TOGETHER:
+            continue
+        fit = _fit(one @ _turned(to_level), other @ _turned(other_to_level))
+        if fit is None or fit[3].sum() <= most:
+            continue
+        scale, turn, shift, fits = fit
+        both = sorted(_steps(poses, shots, first).keys() & _steps(others, shots, second).keys())
+        wrong = {both[k] for k in np.flatnonzero(~fits).tolist()}
+        misfits = {name for name, (camera, step) in shots.items() if camera in (first, second) and step in wrong}
+        moved = {}
+        for name in others.keys() - misfits:
+            rotation = others[name][:, :3] @ other_to_level.T @ turn.T @ to_level
+            centre = to_level.T @ (scale * turn @ other_to_level @ camera_centre(others[name]) + shift)
+            moved[name] = pose(rotation, -rotation @ centre)
+        most, best = int(fits.sum()), Joint(moved, frozenset(misfits & poses.keys()))
+    return best
 
 
 def _turned(to_level: FloatArray) -> FloatArray:
@@ -166,29 +173,44 @@ def _fit(one: FloatArray, other: FloatArray) -> tuple[float, FloatArray, FloatAr
     """Scale, rotation (3, 3) about the vertical and translation (3,) of a level map to another, from poses (K, 3, 4) in
     both of images that were taken together, and which of these fit (K,); None if too few do.
 
-    All pairs of images are tried, each of which fixes a transform: the distance the scale, the direction the yaw.
+    All pairs of times are tried, each of which fixes a transform; then it is fitted to all that fit the best one.
     """
     here, there = _centres(one), _centres(other)
     step = _step(here)
     if step == 0.0:
         return None
-    best: tuple[int, float, tuple[float, FloatArray, FloatArray, BoolArray]] | None = None
-    for i, j in combinations(range(len(here)), 2):
-        way, other_way = here[j] - here[i], there[j] - there[i]
-        if min(np.hypot(*way[[0, 2]]) / step, np.linalg.norm(other_way)) < 1e-6:
-            continue
-        scale = float(np.linalg.norm(way) / np.linalg.norm(other_way))
-        turn = yaw_rotation(np.arctan2(way[0], way[2]) - np.arctan2(other_way[0], other_way[2]))
-        shift = 0.5 * (here[i] + here[j] - scale * (there[i] + there[j]) @ turn.T)
+
+    def fitting(transform: tuple[float, FloatArray, FloatArray], index: int) -> tuple[int, float, BoolArray]:
+        """How many pairs fit, how well, and which (K,), with cameras turned against each other as at ``index``."""
+        scale, turn, shift = transform
         off = np.linalg.norm(scale * there @ turn.T + shift - here, axis=1) / step
-        fits = (off <= OFF) & _turned_alike(one, other @ _turned(turn), i)
-        score = int(fits.sum()), -float(off[fits].sum())
-        if best is None or score > best[:2]:
-            best = (*score, (scale, turn, shift, fits))
-    if best is None or best[0] < max(MIN_TOGETHER, MIN_FITTING * len(here)):
+        fits = (off <= OFF) & _turned_alike(one, other @ _turned(turn), index)
+        return int(fits.sum()), -float(off[fits].sum()), fits
+
+    best, fits = (0, 0.0), np.zeros(len(here), np.bool_)
+    for i, j in combinations(range(len(here)), 2):
+        transform = _laid_over(here[[i, j]], there[[i, j]])
+        if transform is not None and (found := fitting(transform, i))[:2] > best:
+            best, fits = found[:2], found[2]
+    if best[0] < 2 or (transform := _laid_over(here[fits], there[fits])) is None:
         return None
-    within = here[best[2][3]]
-    return best[2] if np.linalg.norm(np.ptp(within, axis=0)) >= MIN_WAY * step else None
+    count, _, fits = fitting(transform, int(np.argmax(fits)))
+    enough = count >= max(MIN_TOGETHER, MIN_FITTING * len(here))
+    return (*transform, fits) if enough and np.linalg.norm(np.ptp(here[fits], axis=0)) >= MIN_WAY * step else None
+
+
+def _laid_over(here: FloatArray, there: FloatArray) -> tuple[float, FloatArray, FloatArray] | None:
+    """Scale, rotation (3, 3) about the vertical and translation (3,) that take positions ``there`` (K, 3) closest to
+    those ``here`` (K, 3); None if they do not fix them."""
+    middle, other_middle = here.mean(axis=0), there.mean(axis=0)
+    aimed, moved = here - middle, there - other_middle
+    moment = np.sum((aimed[:, 2] + 1j * aimed[:, 0]) * (moved[:, 2] - 1j * moved[:, 0]))
+    spread = float(np.sum(moved**2))
+    if min(abs(moment), spread) < 1e-12:
+        return None
+    scale = float(abs(moment) + np.sum(aimed[:, 1] * moved[:, 1])) / spread
+    turn = yaw_rotation(float(np.angle(moment)))
+    return (scale, turn, middle - scale * turn @ other_middle) if scale > 0.0 else None
 
 
 def _turned_alike(one: FloatArray, other: FloatArray, index: int) -> BoolArray:
@@ -273,9 +295,9 @@ def disagree(
 ) -> tuple[str, str] | None:
     """Two cameras that took images together, but went different ways in two maps; None if there are none.
 
-    The parameters are those of ``joined_poses``: ``poses`` and ``others`` (3, 4) by name, ``downs`` (3,).
+    The parameters are those of ``joint_of``: ``poses`` and ``others`` (3, 4) by name, ``downs`` (3,).
     """
-    if joined_poses(poses, others, downs, shots):
+    if joint_of(poses, others, downs, shots) is not None:
         return None
     for pair in combinations(sorted({camera for camera, _ in shots.values()}), 2):
         for first, second in (pair, pair[::-1]):

@@ -15,7 +15,7 @@ from spherloc.mapping.reconstruction import _camera_in, _joined
 from spherloc.mapping.rig import (
     disagree,
     expected_poses,
-    joined_poses,
+    joint_of,
     lies_apart,
     one_camera,
     shots_of,
@@ -108,9 +108,10 @@ def test_the_map_of_one_camera_is_laid_over_that_of_another():
     other = in_another_frame(right, 0.3, down @ yaw_rotation(2.0))
     for name in ("right/003.png", "right/007.png"):  # these stand elsewhere
         other[name] = pose(other[name][:, :3], other[name][:, 3] + [0.0, 0.0, 4.0])
-    moved = joined_poses(left, other, (DOWN, down @ DOWN), SHOTS)
-    assert moved.keys() == right.keys() - {"right/003.png", "right/007.png"}
-    for name, one in moved.items():
+    joint = joint_of(left, other, (DOWN, down @ DOWN), SHOTS)
+    assert joint is not None and joint.misfits == {"left/003.png", "left/007.png"}
+    assert joint.poses.keys() == right.keys() - {"right/003.png", "right/007.png"}
+    for name, one in joint.poses.items():
         assert rotation_angle(one[:, :3] @ right[name][:, :3].T) < np.radians(5.0)
         assert np.linalg.norm(camera_centre(one) - camera_centre(right[name])) < 0.6  # 0.4 m apart, and seen as one
     assert disagree(left, other, (DOWN, down @ DOWN), SHOTS) is None
@@ -123,7 +124,7 @@ def test_cameras_that_went_different_ways_are_not_joined(rng):
     for name, one in of(true, "right").items():
         centre = camera_centre(one) + rng.normal(size=3) * 4.0
         strayed[name] = pose(one[:, :3], -one[:, :3] @ centre)
-    assert joined_poses(left, strayed, (DOWN, DOWN), SHOTS) == {}
+    assert joint_of(left, strayed, (DOWN, DOWN), SHOTS) is None
     assert disagree(left, strayed, (DOWN, DOWN), SHOTS) == ("left", "right")
     few = dict(list(strayed.items())[:4])
     assert disagree(left, few, (DOWN, DOWN), SHOTS) is None
