@@ -218,4 +218,5 @@ def adjusted(pycolmap: Any, model: Any) -> None:
         images.add_image(number)
     images.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(options, images, model).solve()
+    pycolmap.ObservationManager(model).filter_observations_with_negative_depth()
     model.update_point_3d_errors()

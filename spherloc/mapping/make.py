@@ -18,7 +18,7 @@ from spherloc.mapping.new_images import NewImages
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.positions import Positions, gps_of_images
 from spherloc.mapping.reconstruction import DATABASES, reconstruct
-from spherloc.mapping.rig import disagree, shots_of
+from spherloc.mapping.rig import Shots, disagree, shots_of, went_apart
 from spherloc.mapping.scene_files import SCENE
 from spherloc.mapping.stated_gravity import StatedGravity
 from spherloc.mapping.upright import (
@@ -94,7 +94,7 @@ class Map:
     stated: Mapping[str, Gravity] = field(default_factory=dict)
     """Gravity of photographs that a file states, by name."""
     opposed: tuple[str, str] | None = None
-    """Two cameras that took images together, but went different ways in this map and in one of ``groups``."""
+    """Two cameras that took images together, but went different ways in this map, or in it and one of ``groups``."""
 
 
 def make_map(request: MapRequest, folder: Path, tell: Tell = lambda *_: None) -> Map:
@@ -178,12 +178,14 @@ def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
         group, level, scale = found
         own = write_map(*found, views, request.images, place, request.new_images, kept)
         groups.append(replace(made, made=group, level=level, scale=scale, written=own))
-    shots = shots_of(views)
-    for group in groups:
-        downs = made.level.down, group.level.down
-        if opposed := disagree(made.made.poses, group.made.poses, downs, shots):
-            made = replace(made, opposed=opposed)
-    return replace(made, groups=tuple(groups))
+    return replace(made, groups=tuple(groups), opposed=_opposed(made, groups, shots_of(views)))
+
+
+def _opposed(made: Map, groups: Sequence[Map], shots: Shots) -> tuple[str, str] | None:
+    """See ``Map.opposed``."""
+    poses, down = made.made.poses, made.level.down
+    found = (disagree(poses, group.made.poses, (down, group.level.down), shots) for group in groups)
+    return went_apart(poses, shots) or next(filter(None, found), None)
 
 
 def _worth_a_map(made: Reconstruction) -> bool:

@@ -39,7 +39,7 @@ from spherloc.mapping.misplaced import without_misplaced
 from spherloc.mapping.model import Reconstruction, parted, registered, untangled, worth
 from spherloc.mapping.pairs import MIN_MATCHES, ImagePairs, relative
 from spherloc.mapping.parallel import Tell, as_completed
-from spherloc.mapping.rig import Shots, joint_of, lies_apart, one_camera, shots_of, with_ties
+from spherloc.mapping.rig import Shots, joint_of, one_camera, shots_of, went_apart, with_ties
 from spherloc.mapping.rotations import agreeing
 from spherloc.mapping.triangles import Pair, open_triangles
 from spherloc.mapping.upright import level_of
@@ -147,7 +147,7 @@ def reconstruct(
     ]
     candidates = [models for models in made if models]
     if rigid:
-        candidates = [models for models in candidates if not any(lies_apart(one.poses, shots) for one in models)]
+        candidates = [models for models in candidates if not any(went_apart(one.poses, shots) for one in models)]
     if not candidates:
         raise InputError(
             f"COLMAP could not start a map from these {len(views)} photographs, although pairs of them match: they "

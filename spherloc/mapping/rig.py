@@ -81,16 +81,17 @@ def _camera_and_key(name: str) -> tuple[str, float] | None:
     return camera, float(key[0]) if time_ns is None else float(time_ns)
 
 
-def lies_apart(poses: Mapping[str, FloatArray], shots: Shots) -> bool:
-    """Whether two cameras that took images together went different ways in a map of ``poses`` (3, 4)."""
+def went_apart(poses: Mapping[str, FloatArray], shots: Shots) -> tuple[str, str] | None:
+    """Two cameras that took images together, but went different ways in a map of ``poses`` (3, 4); None if there are
+    none."""
     for first, second in combinations(sorted({camera for camera, _ in shots.values()}), 2):
         one, other = _together(poses, poses, shots, (first, second))
         if len(one) >= MIN_TOGETHER:
             here = _centres(one)
             apart = np.linalg.norm(here - _centres(other), axis=1)
             if np.median(apart) > APART * _step(here) and _relative(one, other) is None:
-                return True
-    return False
+                return first, second
+    return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -85,8 +85,8 @@ def _joined_words(made: Map, found: Photographs) -> list[str]:
 
 def _opposed_words(first: str, second: str) -> str:
     return (
-        f"{first} and {second} took images together, but went different ways in their maps: if they are fixed to each "
-        "other, one of the maps is wrong"
+        f"{first} and {second} took images together, but went different ways as they are mapped: if they are fixed to "
+        "each other, a map is wrong"
     )
 
 

@@ -16,9 +16,9 @@ from spherloc.mapping.rig import (
     disagree,
     expected_poses,
     joint_of,
-    lies_apart,
     one_camera,
     shots_of,
+    went_apart,
     with_ties,
     words,
 )
@@ -128,10 +128,10 @@ def test_cameras_that_went_different_ways_are_not_joined(rng):
     assert disagree(left, strayed, (DOWN, DOWN), SHOTS) == ("left", "right")
     few = dict(list(strayed.items())[:4])
     assert disagree(left, few, (DOWN, DOWN), SHOTS) is None
-    assert lies_apart({**left, **strayed}, SHOTS)
-    assert not lies_apart(true, SHOTS)
+    assert went_apart({**left, **strayed}, SHOTS) == ("left", "right")
+    assert went_apart(true, SHOTS) is None
     aside = {name: pose(one[:, :3], one[:, 3] + [0.0, 0.0, 9.0]) for name, one in of(true, "right").items()}
-    assert not lies_apart({**left, **aside}, SHOTS), "far apart, but as two fixed cameras are"
+    assert went_apart({**left, **aside}, SHOTS) is None, "far apart, but as two fixed cameras are"
 
 
 def test_an_image_is_expected_where_the_other_camera_says():
