@@ -73,7 +73,6 @@ def test_a_map_takes_it_and_says_how_good_it_is(rng):
         scale_by_positions(poses, Positions({}, "GPS"), level)
 
 
-@pytest.mark.parametrize("unit", [1, 10**9])
 @pytest.mark.parametrize("titles", ["lat,lon", "lon,lat"])
 def test_latitudes_and_longitudes_that_are_exchanged(tmp_path, rng, titles):
     centres = rng.normal(size=(8, 3)) * [20.0, 15.0, 0.5]
@@ -96,6 +95,7 @@ def test_metres_far_from_the_origin_are_no_degrees(tmp_path):
     assert len(read_positions(path, VIEWS).by_name) == len(NAMES)
 
 
+@pytest.mark.parametrize("unit", [1, 10**9])
 def test_a_trajectory_is_asked_at_the_times_of_the_images(tmp_path, unit):
     """TUM's rows in seconds and in nanoseconds: NAMES[3] lies at 3.5 s, between poses at 3.4 and 3.8 s."""
     path = tmp_path / "poses.txt"
