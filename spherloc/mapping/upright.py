@@ -215,4 +215,4 @@ def upright_frame(level: Level) -> FloatArray:
 
 def _some(poses: Mapping[str, FloatArray]) -> str:
     names = sorted(poses)
-    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

@@ -1,6 +1,7 @@
 """The scale of a map by positions of another source, some of them wrong; their files, and GPS in photographs."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from spherloc.geometry import so3_exp
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
 from spherloc.mapping.make import ScaleMeasurement
 from spherloc.mapping.positions import Positions, gps_of_images, local_metres, overlaid, read_positions
-from spherloc.mapping.upright import Level, scale_by_positions
+from spherloc.mapping.upright import Level, MapScale, scale_by_positions
+from spherloc_viz.commands.map_report import other_units
 
 CLOCK_S = 1_700_000_000
 NAMES = [f"frame_{CLOCK_S + index}_{500_000_000 * (index % 2):09d}.jpg" for index in range(8)]
@@ -71,6 +73,13 @@ def test_a_map_takes_it_and_says_how_good_it_is(rng):
         scale_by_positions(poses, Positions(noise, "GPS"), level)
     with pytest.raises(InputError, match="GPS gave no scale: no image of the map has a position, but 4 are needed"):
         scale_by_positions(poses, Positions({}, "GPS"), level)
+
+
+def test_a_group_says_its_units_where_the_map_has_others():
+    metres, unknown = (SimpleNamespace(scale=MapScale(1.0, source)) for source in ("a and b are 2 m apart", ""))
+    assert other_units(metres, unknown) == ", in metres (a and b are 2 m apart)"
+    assert other_units(unknown, metres) == ", units unknown"
+    assert other_units(metres, metres) == "" == other_units(unknown, unknown)
 
 
 @pytest.mark.parametrize("titles", ["lat,lon", "lon,lat"])
