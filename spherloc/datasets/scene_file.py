@@ -102,7 +102,8 @@ def read_table(path: Path) -> dict[str, Any]:
     with reading(path, ADVICE):
         content = read_file(path, MAX_BYTES)
     try:
-        table = tomllib.loads(content.decode("utf-8-sig"))
+        text_of_file = content.decode("utf-8-sig")
+        table = tomllib.loads(text_of_file)
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file in UTF-8; give the path of a scene file (TOML).") from None
     except tomllib.TOMLDecodeError as error:
@@ -112,7 +113,8 @@ def read_table(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: not valid TOML: {why}; correct the file there.") from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a usable scene file ({reason(error)}); correct or replace it.") from None
-    if wrong := _escaped_path(table, path.parent):
+    several_lines = any(quotes in text_of_file for quotes in ('"""', "'''"))  # such texts have line ends themselves
+    if not several_lines and (wrong := _escaped_path(table, path.parent)):
         raise InputError(f"{path}: '{wrong}' {_BACKSLASHES}")
     return table
 

@@ -289,6 +289,9 @@ def test_texts_and_names_that_are_there_may_have_escapes(tmp_path):
     path = tmp_path / "scene.toml"
     (tmp_path / "a\tb").mkdir()
     path.write_text('kind = "x"\nname = "a\\tb"\nabout = "a\\nb"\nimages = "a\\tb"\nfile = \'C:\\temp\'\n')
+    story = tmp_path / "story.toml"
+    story.write_text('story = """\nOne.\nTwo."""\n')
+    assert read_table(story) == {"story": "One.\nTwo."}
     assert read_table(path)["images"] == "a\tb" and read_table(path)["file"] == r"C:\temp"
 
 
