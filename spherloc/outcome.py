@@ -1,9 +1,10 @@
 """Judges a run without the truth: localized, doubtful or failed, by one rule.
 
 A pose is believed if its inliers are more than chance explains, if no clearly different pose is supported about as well
-and no pose with another gravity much better, if they fix it to within the errors of a success, and if they do not lie
-on one thing in a panorama while nothing else in it agrees. Each condition has a margin, which is 0 at its limit; the
-smallest margin is the run's score.
+and no pose with another gravity much better, if they fix it to within the errors of a success, if no clearly different
+pose, found without those on which it depends most, fits all matches about as well, and if they do not lie on one thing
+in a panorama while nothing else in it agrees. Each condition has a margin, which is 0 at its
+limit; the smallest margin is the run's score.
 """
 
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.spread import spread_in
 from spherloc.consensus.two_point_search import search_two_point
 from spherloc.diagnosis.evidence import MIN_SDS, agreeing, different, sd_of
+from spherloc.diagnosis.rival import rival_of
 from spherloc.free_gravity import MAX_NFA, MIN_LEAD, count_distinct, expected_by_chance, lead, nearby_support
 from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD
 from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
@@ -102,6 +104,7 @@ def _judge(trace: Trace) -> Judgement:
         _gravity_margin(aligned, state, errors, inliers, trace.options),
         _error_margin(trace, aligned, state, inliers),
         _spread_margin(trace, inliers),
+        _rival_margin(trace, aligned, state, inliers),
     ]
     score = min(margin for margin, _ in found)
     reasons = tuple(reason for margin, reason in found if margin < 0.0)
@@ -177,3 +180,9 @@ def _spread_margin(trace: Trace, inliers: BoolArray) -> tuple[float, str]:
     """Margin against an object or a facade that looks alike elsewhere."""
     spread = spread_in(trace.problem, inliers)
     return (np.inf, "") if spread is None else (spread.margin, spread.sentence)
+
+
+def _rival_margin(trace: Trace, aligned: AlignedProblem, state: FloatArray, inliers: BoolArray) -> tuple[float, str]:
+    """Margin over a clearly different pose that is found without the inliers on which this one depends most."""
+    rival = rival_of(aligned, state, inliers, trace.options, float(trace.options.bound_px))
+    return (np.inf, "") if rival is None else (rival.margin, rival.sentence)

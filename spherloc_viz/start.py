@@ -118,6 +118,12 @@ def _no_command(words: Sequence[str]) -> str:
     near = difflib.get_close_matches(words[0], known, 1)
     places = [word for word in words if word and Path(word).exists()]
     if places and not near:
+        from spherloc.datasets.given_path import what_it_is  # only where it is needed: it takes a tenth of a second
+        from spherloc_viz.given_files import is_recording
+
+        path = Path(places[0])
+        if not is_recording(path) and (told := what_it_is(path)):
+            return told
         return f"{words[0]!r} is no command; to open {places[0]!r}: spherloc play {shlex.quote(places[0])}"
     meant = f"did you mean {near[0]!r}? " if near else ""
     return f"{words[0]!r} is no command; {meant}spherloc alone lists all commands."

@@ -346,10 +346,17 @@ def test_the_first_screen_names_every_command_and_fits() -> None:
 
 def test_a_word_that_is_no_command_is_told_what_to_do(tmp_path: Path) -> None:
     assert answer(["play"]) is None and answer(["--unknown"]) is None
-    told, code = answer(["open", str(tmp_path)]) or ("", 0)
-    assert code == 2 and f"to open '{tmp_path}': spherloc play {tmp_path}" in told
-    told, code = answer([str(tmp_path)]) or ("", 0)
-    assert code == 2 and f"spherloc play {tmp_path}" in told
+    for name in ("scene.toml", "run.rrd"):
+        path = tmp_path / name
+        path.touch()
+        told, code = answer(["open", str(path)]) or ("", 0)
+        assert code == 2 and f"to open '{path}': spherloc play {path}" in told
+        assert answer([str(path)]) == (told.replace("'open'", f"'{path}'"), 2)
+    for name, said in (("photos.zip", "is an archive; unpack it"), ("trip.pdf", "is a PDF document; save the photo")):
+        path = tmp_path / name
+        path.touch()
+        told, code = answer([str(path)]) or ("", 0)
+        assert code == 2 and f"spherloc: {path}: {said}" in told and "play" not in told
     told, code = answer(["localise", str(tmp_path)]) or ("", 0)
     assert code == 2 and "did you mean 'localize'?" in told
 

@@ -14,7 +14,8 @@ from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.failures import MAKERS, failure_case
 from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, diagnose
-from spherloc.diagnosis.evidence import apart, gather, pose_sd
+from spherloc.diagnosis.evidence import apart, gather
+from spherloc.diagnosis.information import pose_sd
 from spherloc.estimators import default_options, estimate
 from spherloc.estimators.base import options_type
 from spherloc.metrics import evaluate

@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.failures import failure_case
 from spherloc.diagnosis import Cause, diagnose
 from spherloc.estimators import default_options, estimate
 from spherloc.estimators.base import options_type
+from spherloc.geometry import yaw_rotation
 from spherloc.metrics import evaluate
 from spherloc.outcome import Outcome, judge
+from spherloc.problem import Problem
 
 
 def solved(problem, estimator="ransac-2p", **options):
@@ -78,6 +81,38 @@ def test_a_refinement_that_keeps_a_wrong_gravity_is_doubtful(scene_of):
         wrong += not evaluate(trace).success
         believed += judge(trace).outcome is Outcome.LOCALIZED and not evaluate(trace).success
     assert wrong >= 4 and not believed
+
+
+def on_one_circle(rng, right, wrong):
+    """Thirty matches of points on a circle through the camera, which are seen alike from all of the circle; ``right``
+    ones that fix the camera, and ``wrong`` ones that agree with a place 0.9 m farther along the circle."""
+
+    def seen_from(angle_rad, points):
+        """Bearings in a camera on the circle that looks across it: half of the angle turns what it sees on it."""
+        turn = yaw_rotation(-angle_rad / 2.0)
+        rays = (points - 8.5 * np.array([-np.sin(angle_rad), 0.0, -np.cos(angle_rad)])) @ turn.T
+        return rays / np.linalg.norm(rays, axis=1)[:, None]
+
+    camera = Equirectangular(2000, 1000)
+    across = rng.uniform(-1.2, 1.2, 30)
+    far = 8.5 * np.column_stack([np.sin(across), rng.uniform(-0.02, 0.02, 30), np.cos(across)])
+    others = rng.uniform([-8.0, -2.0, -2.0], [8.0, 2.0, 8.0], (right + wrong + 60, 3))
+    anywhere = rng.normal(size=(60, 3))
+    bearings = [seen_from(0.0, far), seen_from(0.0, others[:right]), seen_from(0.105, others[right:-60]), anywhere]
+    pixels = camera.project(np.concatenate(bearings))[0] + rng.normal(0.0, 0.5, (len(far) + len(others), 2))
+    down = np.array([0.0, 1.0, 0.0])
+    points = np.concatenate([far, others])
+    return Problem("one circle", camera, pixels, points, gravity_camera=down, gravity_map=down)
+
+
+@pytest.mark.parametrize("right, wrong", [(25, 0), (8, 8)])
+def test_wrong_matches_that_fix_a_pose_which_most_leave_open(rng, right, wrong):
+    """Eight wrong matches are as many as the right ones, and the others agree with both."""
+    trace = solved(on_one_circle(rng, right, wrong), "mc-exact")
+    judged = judge(trace)
+    assert np.count_nonzero(trace.inlier_mask) >= 30 + max(right, wrong) - 2
+    assert (judged.outcome is Outcome.LOCALIZED) == (not wrong)
+    assert any("all matches about as well" in reason for reason in judged.reasons) == bool(wrong)
 
 
 def test_no_pose_has_failed_and_a_judgement_is_repeatable(scene_of):

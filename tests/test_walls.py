@@ -219,6 +219,11 @@ def test_the_command_line_answers_before_anything_large_is_loaded():
     assert not told_by(scenes + LOADER.format(names=[])) & large
 
 
+def test_a_map_alone_does_not_load_what_localizes():
+    code = "from spherloc_viz.commands.image_commands import _localize_by_default; assert _localize_by_default(()) == 0"
+    assert not told_by(f"{code}\nimport sys; print(*sys.modules)") & {"spherloc_viz.commands.localize", "numpy"}
+
+
 def test_the_first_picture_waits_for_nothing_that_it_does_not_need():
     """Recordings and lessons come later, and what they need takes a fifth of all imports: see what the functions that
     read and write them import themselves."""

@@ -21,7 +21,9 @@ MAX_FOLDERS = 50
 """Largest number of subfolders that are searched for images."""
 
 _COLMAP = "a scene of kind colmap localizes its images: spherloc scenes colmap prints one to start from"
+_SAVED = "save the photographs in it as JPEG or PNG files, then make a map of their folder with: spherloc map FOLDER"
 _FILES = {
+    **dict.fromkeys((".doc", ".docx", ".key", ".odp", ".odt", ".ppt", ".pptx"), ("a document", _SAVED)),
     ".bin": ("a binary file, maybe of a COLMAP model", f"give its folder in a scene file: {_COLMAP}"),
     ".csv": (
         "a table",
@@ -32,10 +34,7 @@ _FILES = {
         f"the folder with cameras, images and points3D is the map, and {_COLMAP}",
     ),
     ".h5": ("an HDF5 file, such as hloc writes", "a scene of kind hloc names it: spherloc scenes hloc prints one"),
-    ".pdf": (
-        "a PDF document",
-        "save the photographs in it as JPEG or PNG files, then make a map of their folder with: spherloc map FOLDER",
-    ),
+    ".pdf": ("a PDF document", _SAVED),
     ".ply": ("a point cloud or a mesh", "a scene of kind newer-college names it as prior_map"),
     ".vrs": (
         "a recording of Project Aria's glasses",
@@ -73,7 +72,7 @@ def _file(path: Path) -> tuple[str, str]:
     if suffix in VIDEOS:
         return "a video", f"make a map of its frames with: spherloc map frames --video {_quoted(path)}"
     what, advice = _FILES.get(suffix, ("not a scene file", ""))
-    return what, advice if suffix == ".pdf" else f"{advice}; else {SCENE}" if advice else SCENE
+    return what, advice if advice == _SAVED else f"{advice}; else {SCENE}" if advice else SCENE
 
 
 def _folder(path: Path) -> tuple[str, str]:

@@ -28,6 +28,9 @@ TRUE_INLIER_PX = 8.0
 ASSUMED_DOWN_DEG = 5.0
 """Bound on the error of a map's gravity that is taken from how its cameras were held."""
 
+LIKE_REFERENCE = "its most similar reference"
+"""Source of a gravity that is taken from a reference."""
+
 MAX_BOUND_RAD = float(np.radians(85.0))
 
 Thresholds = tuple[tuple[float, float], ...]
@@ -201,7 +204,7 @@ class MapScene:
     def _like(self, reference: View) -> Gravity:
         """Gravity of a query that has the roll and pitch of a reference."""
         down = np.asarray(reference.cam_from_map)[:, :3] @ self.gravity_map
-        return Gravity(down / np.linalg.norm(down), "its most similar reference", by_map=True)
+        return Gravity(down / np.linalg.norm(down), LIKE_REFERENCE, by_map=True)
 
 
 def _contradiction(stated: Gravity, nearby: Gravity | None) -> tuple[str, ...]:

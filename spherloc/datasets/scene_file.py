@@ -4,6 +4,7 @@ import ast
 import importlib
 import inspect
 import math
+import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ import numpy as np
 from spherloc import registry
 from spherloc.datasets.given_path import what_it_is
 from spherloc.errors import InputError, reason, show
-from spherloc.files import is_file, read_file, reading, size_of
+from spherloc.files import is_file, is_folder, read_file, reading, size_of
 from spherloc.problem import Problem
 
 MAX_BYTES = 1_000_000
@@ -101,13 +102,47 @@ def read_table(path: Path) -> dict[str, Any]:
     with reading(path, ADVICE):
         content = read_file(path, MAX_BYTES)
     try:
-        return tomllib.loads(content.decode("utf-8-sig"))
+        text_of_file = content.decode("utf-8-sig")
+        table = tomllib.loads(text_of_file)
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file in UTF-8; give the path of a scene file (TOML).") from None
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {reason(error)}; correct the file there.") from None
+        why = reason(error)
+        if _BAD_ESCAPE.match(why) and (place := _LINE.search(why)):
+            raise InputError(f"{path}: line {place[1]} {_BACKSLASHES}") from None
+        raise InputError(f"{path}: not valid TOML: {why}; correct the file there.") from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a usable scene file ({reason(error)}); correct or replace it.") from None
+    several_lines = any(quotes in text_of_file for quotes in ('"""', "'''"))  # such texts have line ends themselves
+    if not several_lines and (wrong := _escaped_path(table, path.parent)):
+        raise InputError(f"{path}: '{wrong}' {_BACKSLASHES}")
+    return table
+
+
+_PROSE = ("about", "name")
+"""Keys of texts for people."""
+_BAD_ESCAPE = re.compile(r"Unescaped '\\'|Invalid hex value|Escaped character is not")
+"""Begins what ``tomllib`` says of a backslash in double quotes that begins no escape."""
+_LINE = re.compile(r"\(at line (\d+),")
+_CONTROL = re.compile(r"[\b\t\n\f\r]")
+"""What single letters after a backslash stand for."""
+_BACKSLASHES = (
+    r"has a backslash in double quotes, where it begins an escape such as \t; write a path with forward slashes, or in "
+    "single quotes."
+)
+
+
+def _escaped_path(table: Mapping[str, Any], folder: Path) -> str:
+    """The first key whose text has a character that only an escape gives, and is no path from the folder; else ""."""
+    for key, value in table.items():
+        for inner in value if isinstance(value, list) else [value]:
+            if isinstance(inner, dict) and (wrong := _escaped_path(inner, folder)):
+                return wrong
+        if isinstance(value, str) and key not in _PROSE and _CONTROL.search(value):
+            there = folder / value
+            if not is_file(there) and not is_folder(there):
+                return key
+    return ""
 
 
 def check_there(path: Path) -> None:

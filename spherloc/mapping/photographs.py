@@ -20,7 +20,7 @@ from spherloc.frontend.view import View
 from spherloc.images import check_image, grey, read_eighth, read_image
 from spherloc.mapping.advice import advice
 from spherloc.mapping.image_circle import BLACK
-from spherloc.mapping.lens import for_colmap
+from spherloc.mapping.lens import about_principal_point, for_colmap
 from spherloc.types import ByteArray
 
 MIN_IMAGES = 2
@@ -213,6 +213,7 @@ def _of_folder(
     used = [name for name, camera in cameras.items() if any(camera is one for one in camera_of.values())]
     if used and not given:
         remarks.append(f"The calibration found beside them: {', '.join(map(shorten, used))}.")
+    remarks += [about for name in used if (about := about_principal_point(name, cameras[name]))]
     unused = [] if given or used or panorama else beside.unused(sizes)
     remarks += unused
     rest = sorted(name for names in sizes.values() for name in names if name not in camera_of)
@@ -318,7 +319,9 @@ class FoundCalibrations:
         told = (
             f"The calibration beside them is not used ({', '.join(others[:MAX_NAMED])} pixels), as no photograph there"
         )
-        return [f"{told} has its size: scale it to that of the photographs.", *self.refused[:MAX_NAMED]]
+        turned = any((camera.height, camera.width) in sizes for camera in self.cameras.values())
+        what = "turn the photographs by 90°, or calibrate anew" if turned else "scale it to that of the photographs"
+        return [f"{told} has its size: {what}.", *self.refused[:MAX_NAMED]]
 
 
 def calibrations_in(root: Path, inside: str = "") -> FoundCalibrations:

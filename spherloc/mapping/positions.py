@@ -30,6 +30,11 @@ MAX_SCALE_SD = 0.1
 """Largest relative standard deviation of the scale."""
 MAX_GAP_S = 0.5
 """Largest time between two poses of a trajectory that are interpolated."""
+SWAPPED = 3.0
+"""Latitudes and longitudes are taken for exchanged if they fit so many times better in the other order."""
+MAX_SPREAD_DEG = 0.05
+"""Positions that may be latitudes and longitudes, far from 0, are taken for those if they are no farther apart: five
+kilometres, as metres a hand."""
 SAMPLES = 2000
 NEAR_SD = 2.5
 """Positions within this many robust standard deviations are used in the fit."""
@@ -52,6 +57,8 @@ class Positions:
     """Where they come from, in a few words."""
     horizontal: bool = False
     """Whether heights are not used, as with GPS."""
+    other_order: Mapping[str, FloatArray] | None = None
+    """What they are if latitudes and longitudes are exchanged; None where they cannot be."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +157,9 @@ def _of_rows(path: Path, views: Sequence[View]) -> Positions:
             raise InputError(f"{place}: has {len(words)} words; give {what}.")
         numbers = finite_numbers(words[1:4] if columns is None else [words[column] for column in columns], place)
         if columns is not None and not (abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 360.0):
-            raise InputError(f"{place}: {numbers[0]:g}, {numbers[1]:g} is not a latitude and longitude; give degrees.")
+            exchanged = abs(numbers[1]) <= 90.0 and abs(numbers[0]) <= 360.0
+            advice = "exchange the titles of the two columns" if exchanged else "give degrees"
+            raise InputError(f"{place}: {numbers[0]:g}, {numbers[1]:g} is not a latitude and longitude; {advice}.")
         if words[0] in found:
             raise InputError(f"{place}: {show(words[0])} is there a second time; keep one row.")
         count += 1
@@ -162,8 +171,24 @@ def _of_rows(path: Path, views: Sequence[View]) -> Positions:
             "use the file names of the images."
         )
     if columns is None:
+        if _are_degrees(np.array(list(found.values()))):
+            raise InputError(
+                f"{path}: its positions seem to be latitudes and longitudes in degrees, and metres are expected; name "
+                "the columns in the first row: image,lat,lon."
+            )
         return Positions(found, f"the positions in {shorten(path.name)}")
-    return Positions(local_metres(found), f"GPS in {shorten(path.name)}", horizontal=True)
+    exchanged = {name: at[[1, 0, 2]] for name, at in found.items()}
+    possible = all(abs(at[0]) <= 90.0 for at in exchanged.values())
+    other = local_metres(exchanged) if possible else None
+    return Positions(local_metres(found), f"GPS in {shorten(path.name)}", horizontal=True, other_order=other)
+
+
+def _are_degrees(positions: FloatArray) -> bool:
+    """Whether positions (N, 3) look like latitudes and longitudes, in any order, of one place."""
+    flat = positions[:, :2]
+    spread, away = np.ptp(flat, axis=0).max(), np.abs(flat).max()
+    in_range = np.sort(np.abs(flat).max(axis=0)) <= [90.0, 180.0]
+    return len(flat) >= MIN_POSITIONS and 100.0 * spread < away and spread < MAX_SPREAD_DEG and bool(in_range.all())
 
 
 def _are_titles(words: Sequence[str]) -> bool:

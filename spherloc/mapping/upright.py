@@ -14,7 +14,7 @@ from spherloc.frontend.view import Gravity
 from spherloc.geometry import DOWN, align_to_down, camera_centre
 from spherloc.mapping.advice import advice
 from spherloc.mapping.line_gravity import middle
-from spherloc.mapping.positions import MAX_SCALE_SD, Positions, overlaid
+from spherloc.mapping.positions import MAX_SCALE_SD, SWAPPED, Positions, overlaid
 from spherloc.types import FloatArray
 
 MIN_LINES = 3
@@ -166,7 +166,8 @@ def _deepest_layer(depths: FloatArray) -> FloatArray:
 def scale_by_positions(poses: Mapping[str, FloatArray], positions: Positions, level: Level) -> MapScale:
     """The scale that aligns the images of ``poses`` (3, 4) with positions from another source.
 
-    Raises ``InputError`` if too few have a position, or if these do not fix the scale to ``MAX_SCALE_SD``.
+    Raises ``InputError`` if too few have a position, or if these do not fix the scale to ``MAX_SCALE_SD``, and if
+    latitudes and longitudes fit far better when they are exchanged.
     """
     names = [name for name in poses if name in positions.by_name]
     centres = np.array([camera_centre(poses[name]) for name in names]).reshape(-1, 3)
@@ -176,13 +177,21 @@ def scale_by_positions(poses: Mapping[str, FloatArray], positions: Positions, le
     try:
         found = overlaid(centres, places)
     except InputError as error:
-        raise InputError(f"{positions.source} gives no scale: {error}") from None
+        raise InputError(f"{positions.source} gave no scale: {error}") from None
     off_m = dict(zip(names, found.off_m.tolist(), strict=True))
     near = int(np.count_nonzero(found.near))
     measured = f"{near} of {len(names)} images fit it, {float(np.median(found.off_m[found.near])):.2g} m off"
+    if (other := positions.other_order) is not None:
+        exchanged = overlaid(centres, np.array([other[name] for name in names])[:, :2])
+        off = [float(np.median(fit.off_m)) for fit in (found, exchanged)]
+        if SWAPPED * off[1] < off[0]:
+            raise InputError(
+                f"{positions.source} gave no scale: its latitudes and longitudes seem to be exchanged, since in the "
+                f"other order the images fit to {off[1]:.2g} m instead of {off[0]:.2g} m; exchange them."
+            )
     if found.scale_sd > MAX_SCALE_SD or 2 * near < len(names):
         raise InputError(
-            f"{positions.source} gives no scale: {measured} in the median, so that the scale is uncertain by "
+            f"{positions.source} gave no scale: {measured} in the median, so that the scale is uncertain by "
             f"{found.scale_sd:.0%}; {advice('other scale')}."
         )
     source = f"{positions.source}: {measured} in the median, the scale is good to {max(found.scale_sd, 5e-4):.1%}"
@@ -206,4 +215,4 @@ def upright_frame(level: Level) -> FloatArray:
 
 def _some(poses: Mapping[str, FloatArray]) -> str:
     names = sorted(poses)
-    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

@@ -350,6 +350,8 @@ def map(
 
 def _localize_by_default(scenes: Sequence[Path]) -> int:
     """Localize the same photographs in the maps of these scene files, as ``localize`` without options does in one."""
+    if not scenes:
+        return 0  # before what localizes is imported
     from spherloc_viz.commands.localize import Solving, localize_in_maps
     from spherloc_viz.commands.run import Records
 

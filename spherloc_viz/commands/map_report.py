@@ -64,7 +64,10 @@ def summary(made: Map, found: Photographs) -> list[str]:
     if missing:
         lines.append(f"left out      {', '.join(missing[:5])}{', …' if len(missing) > 5 else ''}: see the report")
     for group in made.groups:
-        lines.append(f"on its own    {len(group.written.poses)} images that could not be joined: {group.written.scene}")
+        lines.append(
+            f"on its own    {len(group.written.poses)} images that could not be joined{other_units(group, made)}: "
+            f"{group.written.scene}"
+        )
     if made.opposed:
         lines.append(f"in doubt      {_opposed_words(*made.opposed)}")
     if made.made.contradictions:
@@ -103,6 +106,13 @@ def _units_unknown(made: Map) -> str:
     if why and made.carried_deg:
         why += f" (what was masked around straight down may be the ground{advice('carried')})"
     return f"units unknown; {why or advice('any scale')}"
+
+
+def other_units(group: Map, made: Map) -> str:
+    """What the units of the map of a group are, if the scale was measured in one of the two maps alone."""
+    if bool(group.scale.source) == bool(made.scale.source):
+        return ""
+    return f", in metres ({group.scale.source})" if group.scale.source else ", units unknown"
 
 
 def _down(made: Map) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from statistics import median
 
-from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.map_scene import LIKE_REFERENCE, MapScene
 from spherloc.diagnosis.causes import Cause
 from spherloc.errors import shorten
 from spherloc.experiments.configuration import Configuration
@@ -15,6 +15,8 @@ from spherloc.frontend.pipeline import NO_POINT
 from spherloc_viz.layers.where_taken import nearest
 
 MAX_TOLD, MAX_EACH = 5, 20
+MIN_BEYOND = 4
+"""Number of localized queries with gravity beyond its bound from which on they have a common reason."""
 FAR = 1e5
 """Coordinates of a wrong pose can be larger; they are rounded."""
 
@@ -117,7 +119,8 @@ def _trajectory_lines(error: TrajectoryError | None, setting: Configuration) -> 
 
 
 def gravity_by_source(rows: Sequence[QueryResult]) -> Iterator[str]:
-    """A line for each source of gravity: its number of queries, its bounds and its true errors."""
+    """A line for each source of gravity: its number of queries, its bounds and its true errors; and one where most
+    of its localized queries show it to be wrong."""
     by_source: dict[str, list[QueryResult]] = {}
     for row in rows:
         if row.gravity_source:
@@ -129,6 +132,15 @@ def gravity_by_source(rows: Sequence[QueryResult]) -> Iterator[str]:
         off = f"; off the truth by {median(errors):.3g} deg in the median, {max(errors):.3g} at most" if errors else ""
         queries = "query" if len(told) == 1 else "queries"
         yield f"gravity from {shorten(source)} in {len(told)} {queries}, within {min(bounds):.2g}{most} deg{off}"
+        sure = [row for row in told if row.status == LOCALIZED]
+        beyond = sum(row.diagnosis == Cause.GRAVITY_OFF for row in sure)
+        if beyond >= MIN_BEYOND and 2 * beyond >= len(sure):
+            why = (
+                "they are held otherwise than the references"
+                if source == LIKE_REFERENCE
+                else "down in the map ([gravity] map of the scene file) may be tilted"
+            )
+            yield f"in {beyond} of {len(sure)} localized ones the matches show gravity to be beyond that: {why}"
 
 
 def without_lines(rows: Sequence[QueryResult]) -> Iterator[str]:

@@ -88,6 +88,7 @@ def test_other_files_that_end_like_scene_files_are_none(tmp_path):
         ("photos.ZIP", "is an archive; unpack it, and give the folder or the file that comes out of it."),
         ("map.tar.gz", "is an archive; unpack it"),
         ("paper.pdf", "is a PDF document; save the photographs in it as JPEG or PNG files, then make a map of their"),
+        ("trip.DOCX", "is a document; save the photographs in it as JPEG or PNG files, then make a map of their"),
         ("README.md", "is not a scene file; give the path of a scene file (TOML) or a bundled scene's name"),
     ],
 )

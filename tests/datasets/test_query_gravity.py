@@ -7,12 +7,12 @@ import pytest
 
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets import load_scene
-from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.map_scene import LIKE_REFERENCE, MapScene
 from spherloc.datasets.query_gravity import read_gravity, read_gravity_file
-from spherloc.diagnosis import diagnose
+from spherloc.diagnosis import Cause, diagnose
 from spherloc.errors import InputError, ProblemError
 from spherloc.estimators import default_options
-from spherloc.experiments.results import json_line, row_of_json
+from spherloc.experiments.results import LOCALIZED, QueryResult, json_line, row_of_json
 from spherloc.experiments.sequence import localize
 from spherloc.frontend.gravity_from_lines import NOT_FOUND
 from spherloc.frontend.view import Gravity, Matches, View
@@ -258,3 +258,15 @@ def test_runs_and_sequences_say_where_gravity_came_from(tmp_path, problem):
     said = list(without_lines([row, *without]))
     assert said[0] == f"no gravity from lines of 0.png: {why}" and len(said) == 6
     assert said[5] == "no gravity from lines of 2 more, see results.csv"
+
+
+@pytest.mark.parametrize(
+    ("source", "why"), [("lines of the image", "may be tilted"), (LIKE_REFERENCE, "held otherwise than the references")]
+)
+def test_a_gravity_that_most_queries_contradict_is_doubted(source, why):
+    off = QueryResult(0, "a", LOCALIZED, gravity_source=source, gravity_bound_deg=1.0, diagnosis=Cause.GRAVITY_OFF)
+    right, unknown = replace(off, diagnosis=Cause.OK), replace(off, status="doubtful")
+    told = list(summed_up([*[off] * 4, *[right] * 4, *[unknown] * 9]))
+    assert len(told) == 2 and told[1].startswith("in 4 of 8 localized ones the matches show") and why in told[1]
+    for rows in ([off] * 3, [*[off] * 4, *[right] * 5], [unknown] * 9):
+        assert len(list(summed_up(rows))) == 1

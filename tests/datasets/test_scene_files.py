@@ -7,6 +7,7 @@ from scene_texts import CSV, MEASURED, SYNTHETIC, write, write_measured
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.scene_file import read_table
 from spherloc.errors import InputError
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -265,6 +266,33 @@ def test_pixels_outside_the_image(tmp_path):
 
 def test_missing_scene(tmp_path):
     check_refused(tmp_path / "none.toml", "none.toml", "no such file")
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (r'images = "C:\photos\a.jpg"', "line 3 has a backslash in double quotes"),
+        (r'images = "C:\Users\a"', "line 3 has a backslash in double quotes"),
+        (r'images = "D:\temp\new"', "'images' has a backslash in double quotes"),
+        ('[[references]]\nimage = "old\\new.jpg"', "'image' has a backslash in double quotes"),
+    ],
+)
+def test_a_windows_path_in_double_quotes(tmp_path, line, said):
+    path = tmp_path / "scene.toml"
+    path.write_text(f'kind = "image-folder"\nname = "a"\n{line}\n')
+    with pytest.raises(InputError) as raised:
+        load_scene(path)
+    assert said in str(raised.value) and "forward slashes, or in single quotes" in str(raised.value)
+
+
+def test_texts_and_names_that_are_there_may_have_escapes(tmp_path):
+    path = tmp_path / "scene.toml"
+    (tmp_path / "a\tb").mkdir()
+    path.write_text('kind = "x"\nname = "a\\tb"\nabout = "a\\nb"\nimages = "a\\tb"\nfile = \'C:\\temp\'\n')
+    story = tmp_path / "story.toml"
+    story.write_text('story = """\nOne.\nTwo."""\n')
+    assert read_table(story) == {"story": "One.\nTwo."}
+    assert read_table(path)["images"] == "a\tb" and read_table(path)["file"] == r"C:\temp"
 
 
 def test_scene_is_a_folder(tmp_path):

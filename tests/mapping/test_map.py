@@ -365,6 +365,18 @@ def test_the_calibration_beside_the_photographs_is_taken(tmp_path, rng):
     assert "A file beside them is not used: " in told and "calibration.yaml" in told
 
 
+def test_a_calibration_that_is_turned_is_told(tmp_path, rng):
+    for name in ("a.png", "b.png"):
+        picture(tmp_path / name, 400, 300, rng)
+    for centre, exchanged in (("200 150", False), ("150 200", True), ("260 150", False)):
+        (tmp_path / "cameras.txt").write_text(f"1 PINHOLE 400 300 250 250 {centre}\n")
+        told = " ".join(photographs(tmp_path, {}).remarks)
+        assert ("is at 150, 200, far from the middle of 400 x 300 pixels; if x and y are exch" in told) == exchanged
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 300 400 250 250 150 200\n")
+    with pytest.raises(InputError, match="has its size: turn the photographs by 90°, or calibrate anew"):
+        photographs(tmp_path, {}, find_lens=_no_lens)
+
+
 def _no_lens(paths, size):
     raise InputError("they show nothing")
 

@@ -1,6 +1,7 @@
 """The scale of a map by positions of another source, some of them wrong; their files, and GPS in photographs."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from spherloc.geometry import so3_exp
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
 from spherloc.mapping.make import ScaleMeasurement
 from spherloc.mapping.positions import Positions, gps_of_images, local_metres, overlaid, read_positions
-from spherloc.mapping.upright import Level, scale_by_positions
+from spherloc.mapping.upright import Level, MapScale, scale_by_positions
+from spherloc_viz.commands.map_report import other_units
 
 CLOCK_S = 1_700_000_000
 NAMES = [f"frame_{CLOCK_S + index}_{500_000_000 * (index % 2):09d}.jpg" for index in range(8)]
@@ -67,10 +69,39 @@ def test_a_map_takes_it_and_says_how_good_it_is(rng):
     assert scale.metres_per_unit == pytest.approx(2.0, rel=0.05) and scale.off_m[NAMES[3]] > 10.0
     assert scale.source.startswith("GPS: 7 of 8 images fit it, 0.")
     noise = {name: 60.0 * row for name, row in zip(NAMES, rng.normal(size=(8, 3)), strict=True)}
-    with pytest.raises(InputError, match=r"GPS gives no scale: .* uncertain by .*; give --distance"):
+    with pytest.raises(InputError, match=r"GPS gave no scale: .* uncertain by .*; give --distance"):
         scale_by_positions(poses, Positions(noise, "GPS"), level)
-    with pytest.raises(InputError, match="GPS gives no scale: no image of the map has a position, but 4 are needed"):
+    with pytest.raises(InputError, match="GPS gave no scale: no image of the map has a position, but 4 are needed"):
         scale_by_positions(poses, Positions({}, "GPS"), level)
+
+
+def test_a_group_says_its_units_where_the_map_has_others():
+    metres, unknown = (SimpleNamespace(scale=MapScale(1.0, source)) for source in ("a and b are 2 m apart", ""))
+    assert other_units(metres, unknown) == ", in metres (a and b are 2 m apart)"
+    assert other_units(unknown, metres) == ", units unknown"
+    assert other_units(metres, metres) == "" == other_units(unknown, unknown)
+
+
+@pytest.mark.parametrize("titles", ["lat,lon", "lon,lat"])
+def test_latitudes_and_longitudes_that_are_exchanged(tmp_path, rng, titles):
+    centres = rng.normal(size=(8, 3)) * [20.0, 15.0, 0.5]
+    poses = {name: np.column_stack([np.eye(3), -centre]) for name, centre in zip(NAMES, centres, strict=True)}
+    degrees = [50.0, 8.0] + (2.0 * centres[:, 1::-1] + rng.normal(size=(8, 2))) / [111_229.0, 71_696.0]
+    path = tmp_path / "gps.csv"
+    rows = [f"{name},{at[0]:.7f},{at[1]:.7f}" for name, at in zip(NAMES, degrees, strict=True)]
+    path.write_text("\n".join([f"image,{titles}", *rows]))
+    level, positions = Level(np.array([0.0, 0.0, -1.0]), "a test", 0.0, {}), read_positions(path, VIEWS)
+    if titles == "lat,lon":
+        assert scale_by_positions(poses, positions, level).metres_per_unit == pytest.approx(2.0, rel=0.05)
+        return
+    with pytest.raises(InputError, match=r"seem to be exchanged, since .* fit to \S+ m instead of"):
+        scale_by_positions(poses, positions, level)
+
+
+def test_metres_far_from_the_origin_are_no_degrees(tmp_path):
+    path = tmp_path / "positions.txt"
+    path.write_text("".join(f"{name} 50.{index} 8.{index} 120\n" for index, name in enumerate(NAMES)))
+    assert len(read_positions(path, VIEWS).by_name) == len(NAMES)
 
 
 @pytest.mark.parametrize("unit", [1, 10**9])
@@ -138,7 +169,12 @@ def test_names_may_have_spaces_and_columns_titles(tmp_path, row):
         (f"{NAMES[0]},1,2,3\r{NAMES[1]},1,2,3\r", "line 1: has . words; give image x y z"),
         (f"{NAMES[0]} 1 2 3\n{NAMES[0]} 1 2 3\n", "line 2: .* a second time"),
         ("a.jpg 1 2 3\n", "none of its 1 rows names one of the 8 images"),
-        (f"image lat lon\n{NAMES[0]} 97 8\n", "is not a latitude"),
+        (f"image lat lon\n{NAMES[0]} 97 98\n", "is not a latitude and longitude; give degrees"),
+        (f"image lat lon\n{NAMES[0]} -122.3 37\n", "is not a latitude and longitude; exchange the titles"),
+        (
+            "".join(f"{name} 50.00{index} 8.{index:03d} 120\n" for index, name in enumerate(NAMES)),
+            "seem to be latitudes and longitudes in degrees, .*: image,lat,lon",
+        ),
         ("100.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n", "no pose at the time of any of the 8 images"),
         ("5000.03 0 0 0 0 0 0 1\n5000.23 0 0 0 0 0 0 1\n", "no pose at the time of any of the 8 images"),
         ("100.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n", "line 3: its time is not after"),
