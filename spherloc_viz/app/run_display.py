@@ -231,7 +231,8 @@ class RunDisplay:
             cause = str(diagnosis.cause) if diagnosis is not None and diagnosis.doubtful else ""
             self.panels.draw(run, plain, pause is not None, outcome, selected, not told, offered, (cause, where))
             self.panels.diagnose(*("", "") if hidden else _diagnosed_html(trace, diagnosis, index))
-            self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, not told)
+            right = partial(self.canvas.card_is_right, drawn)
+            self.card.draw(trace, selected, run.kept, alternative, right, not told)
         nearest = sorted(range(len(timeline)), key=lambda other: (abs(other - index), index - other))
         self._to_prepare = deque(
             partial(self._paint_ahead, run, other, selected, told) for other in nearest[1 : 1 + MAX_AHEAD]
