@@ -142,7 +142,10 @@ class LocalWorkers:
         return self._workers + AHEAD - len(self._tasks)
 
     def submit(self, jobs: tuple[Job, ...]) -> None:
-        """Have a worker do these jobs as one task; does not wait."""
+        """Have a worker do these jobs as one task; does not wait.
+
+        Raises ``InputError`` if no process can be started.
+        """
         try:
             with _deaf_to_ctrl_c():
                 future = self._pool.submit(solve, self._plan, jobs, self._keep)
@@ -154,7 +157,10 @@ class LocalWorkers:
         self._tasks[future] = jobs
 
     def collect(self, timeout_s: float) -> list[Done]:
-        """Tasks that ended since the last call; waits at most ``timeout_s`` seconds for the first one."""
+        """Tasks that ended since the last call; waits at most ``timeout_s`` seconds for the first one.
+
+        Raises ``InputError`` if the first process does not start in time.
+        """
         ended, _ = wait(self._tasks, timeout_s, FIRST_COMPLETED)
         if not self._begun.done() and time.monotonic() - self._started > START_S:
             for process in dict(self._pool._processes or {}).values():
