@@ -217,7 +217,9 @@ def test_the_pose_of_a_longer_search_is_compared_with_the_true_one(scene_of):
         said = [text for text in evidence if text.startswith("Truth: the pose of the longer search is off by ")]
         assert len(said) == any(text.startswith("A longer search finds a pose") for text in evidence)
         if said:
-            turn, distance = apart(best.cam_from_map, run.problem.aligned.align_pose(run.problem.truth_cam_from_map))
+            truth = run.problem.truth_cam_from_map
+            assert best is not None and truth is not None
+            turn, distance = apart(best.cam_from_map, run.problem.aligned.align_pose(truth))
             size, degrees = re.findall(r"([\d.]+) (?:c?m)\b.* ([\d.]+)°", said[0])[0]
             metres = float(size) / (100.0 if " cm" in said[0] else 1.0)
             assert metres == pytest.approx(distance, rel=0.06) and float(degrees) == pytest.approx(
