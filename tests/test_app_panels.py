@@ -25,7 +25,7 @@ from spherloc_viz.app.controls.estimator_controls import EstimatorControls, Opti
 from spherloc_viz.app.controls.steps_panel import find_step
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.painter import light_bytes, surface_bytes
-from spherloc_viz.app.text import diagnosis_html, key_step_html, status_html, step_html, table_html
+from spherloc_viz.app.text import cause_html, evidence_html, key_step_html, status_html, step_html, table_html
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.app.workers import LatestWorker
 from spherloc_viz.layers import paint, steps
@@ -68,8 +68,9 @@ def test_every_text_is_escaped() -> None:
         step_html(Step("key", EVIL, EVIL, EVIL, EVIL)),
         table_html(Table("any", ("", ""), ((EVIL, EVIL), ("number", 3.0)))),
         table_html(Table("any", (EVIL, "", ""), ((EVIL, EVIL, EVIL),))),
-        diagnosis_html(Diagnosis(Cause.AMBIGUOUS, True, EVIL, (EVIL,), EVIL, False)),
-        diagnosis_html(Diagnosis(Cause.OK, False, EVIL, (), "", True)),
+        cause_html(Diagnosis(Cause.AMBIGUOUS, True, EVIL, (EVIL,), EVIL, False)),
+        evidence_html(Diagnosis(Cause.AMBIGUOUS, True, EVIL, (EVIL,), EVIL, False)),
+        evidence_html(Diagnosis(Cause.OK, False, EVIL, (), "", True)),
         key_step_html((StepHeading("a", EVIL), StepHeading("b", EVIL), StepHeading("outcome", EVIL)), 1, 0, True),
         status_html(EVIL, wrong=True),
     ]
@@ -138,13 +139,21 @@ def test_the_given_scene_comes_first_and_once(tmp_path: Path) -> None:
 
 def test_a_diagnosis_tells_cause_evidence_and_advice_and_is_quiet_about_good_runs() -> None:
     wrong = Diagnosis(Cause.GRAVITY_OFF, True, "The summary.", ("One.", "Two."), "The advice.", False)
-    html = diagnosis_html(wrong)
-    for part in ("Gravity prior off", "The summary.", "<li", "One.", "Two.", "The advice.", "without the truth"):
-        assert part in html
-    named = diagnosis_html(replace(wrong, advice="Raise bound_px."))
+    above, below = cause_html(wrong), evidence_html(wrong)
+    for part in ("Gravity prior off", "The summary.", "The advice."):
+        assert part in above and part not in below
+    for part in ("<li", "One.", "Two.", "without the truth"):
+        assert part in below and part not in above
+    named = cause_html(replace(wrong, advice="Raise bound_px."))
     assert "Raise Bound (px)." in named, "the page names an option as its settings do"
-    quiet = diagnosis_html(replace(wrong, cause=Cause.OK, doubtful=False, evidence=()))
-    assert "The summary." in quiet and "advice" not in quiet and style.css(style.OUTLIER) not in quiet
+    fine = replace(wrong, cause=Cause.OK, doubtful=False, evidence=())
+    quiet = evidence_html(fine)
+    assert (
+        cause_html(fine) == ""
+        and "The summary." in quiet
+        and "advice" not in quiet
+        and style.css(style.OUTLIER) not in quiet
+    )
 
 
 def test_steps_before_the_outcome_say_where_a_run_goes_wrong_and_not_why() -> None:

@@ -1,6 +1,9 @@
 """Every preset does what its story says, and what it says to try helps."""
 
+import json
+import re
 from dataclasses import replace
+from html import unescape
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.metrics import evaluate
 from spherloc.trace import Trace
 from spherloc_viz.app.catalog import Catalog, RunRequest, SceneRequest
+from spherloc_viz.app.controls.choices import choices_html
 from spherloc_viz.app.controls.presets import RECIPES, Preset, presets
 
 CATALOG = Catalog(None)
@@ -43,6 +47,28 @@ def test_there_are_the_promised_ones_and_each_is_a_sentence() -> None:
         assert len({RunRequest(preset.scene, preset.estimator, preset.options)}) == 1, (
             "requests are kept by their value"
         )
+
+
+@pytest.mark.parametrize("title", PRESETS)
+def test_the_list_says_which_fail(title: str) -> None:
+    preset = PRESETS[title]
+    assert good(solve(preset)) is not preset.fails
+    told = choices_html(tuple(PRESETS.values()), CATALOG, False)
+    assert f"{'Fails' if preset.fails else 'Succeeds'}. {preset.story[:20]}" in unescape(told)
+    assert preset.story[:20] not in choices_html(tuple(PRESETS.values()), CATALOG, True), "it is an answer"
+
+
+def test_each_bundled_scene_says_what_it_is_there_for() -> None:
+    told = json.loads(re.findall('data-choices="([^"]*)"', choices_html((), CATALOG, False))[0].replace("&quot;", '"'))
+    assert set(told) == set(CATALOG.scenes) and all(text.endswith(".") for text in told.values())
+    for label, text in told.items():
+        scene = CATALOG.synthetic(label)
+        if scene is not None:
+            wrong = round(scene.outlier_rate * scene.correspondences)
+            assert f"{scene.correspondences - wrong} of {scene.correspondences} matches are right" in text
+            assert "find the pose" in text
+            for estimator in ("mc", "ransac-2p"):
+                assert good(estimate(CATALOG.problem(SceneRequest(label, 0)), estimator)), estimator
 
 
 def test_a_catalog_with_a_scene_of_its_own_has_them_too(tmp_path) -> None:

@@ -354,10 +354,11 @@ def test_diagnosis_comes_after_the_picture_and_only_for_the_newest_run(
     )
     gate.set()
     until(lambda: 'data-touch="step:' in session._display.panels._diagnosis.content)
-    assert "Two poses." not in session._display.panels._diagnosis.content, "a step before the last tells no cause"
+    assert not session._display.panels.steps.cause.content, "a step before the last tells no cause"
     assert len(seen) == 2 and seen[1] is session._run.trace, "of fifteen runs meanwhile only the newest was diagnosed"
     page.set(session._display.panels.steps._buttons, "Next")
-    until(lambda: "Two poses." in session._display.panels._diagnosis.content)
+    until(lambda: "Two poses." in session._display.panels.steps.cause.content)
+    assert "Both explain 9." in session._display.panels._diagnosis.content
     until(lambda: "cameras/alternative" in session._display.canvas._painter._drawn)
     page.set(session._display.panels.steps._buttons, "Previous")
     until(lambda: not session._display.canvas._painter._drawn["cameras/alternative"][0].visible)
@@ -617,7 +618,7 @@ def test_answers_are_hidden_until_they_are_asked_for(house: House) -> None:
     story, display = session._display.panels, session._controls.display
 
     def told() -> str:
-        parts = (story._summary, story.steps._text, story._diagnosis, story._outcome)
+        parts = (story._summary, story.steps.cause, story.steps._text, story._diagnosis, story._outcome)
         return "".join(part.content for part in parts)
 
     def drawn() -> set[str]:

@@ -185,6 +185,18 @@ def test_from_above_one_sees_where_the_photographs_were_taken(trace: Trace) -> N
     np.testing.assert_allclose(before.position, after.position, atol=1.0)
 
 
+def test_a_card_is_counted_to_cover_what_is_selected_more_than_names(trace: Trace) -> None:
+    view, letter = views.Viewpoint(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.pi / 2), 0.01
+    there = np.array([[0.8, -0.8, 1.0], [-0.8, -0.8, 1.0]])  # y points down
+    aside = views.projected(view, there)[:, 0]
+    dots = Points("selection/points", "selection", there[:1], np.zeros((1, 3), np.uint8), 0.1)
+    picture = replace(paint(trace, 0), scene=(dots, Label("name", "axes", there[1], "name")))
+    for middle, share in zip(aside, (1.0, 0.1), strict=True):
+        low, high = np.array([middle - 0.2, 0.4]), np.array([middle + 0.2, 1.0])
+        assert views.covered(picture, view, low, high, letter) == share
+        assert views.covered(picture, view, low - [0.0, 0.7], high - [0.0, 0.7], letter) == 0.0
+
+
 def test_names_that_would_lie_over_others_give_way_to_the_more_important_ones(trace: Trace) -> None:
     picture = paint(trace, len(steps(trace)) - 1)
     view = views.follow(picture, 1.5)

@@ -210,6 +210,27 @@ def test_real_matches_that_fail_for_a_known_cause():
     assert sum(without == cause for cause, (_, without) in called.items()) >= len(called) - 1, called
 
 
+def test_the_pose_of_a_longer_search_is_compared_with_the_true_one(scene_of):
+    scene, told = scene_of("mei", correspondences=100, outlier_rate=0.97), 0
+    for seed in range(3):
+        run = estimate(scene.problem(seed), "mc", seed=seed)
+        evidence, best = diagnose(run).evidence, gather(run).best
+        said = [text for text in evidence if text.startswith("Truth: the pose of the longer search is off by ")]
+        assert len(said) == any(text.startswith("A longer search finds a pose") for text in evidence)
+        if said:
+            truth = run.problem.truth_cam_from_map
+            assert best is not None and truth is not None
+            turn, distance = apart(best.cam_from_map, run.problem.aligned.align_pose(truth))
+            size, degrees = re.findall(r"([\d.]+) (?:c?m)\b.* ([\d.]+)°", said[0])[0]
+            metres = float(size) / (100.0 if " cm" in said[0] else 1.0)
+            assert metres == pytest.approx(distance, rel=0.06) and float(degrees) == pytest.approx(
+                np.degrees(turn), rel=0.06
+            )
+            told += 1
+        assert not any("longer search is off" in text for text in diagnose(run, use_truth=False).evidence)
+    assert told
+
+
 def test_too_few_right_matches_are_said_to_be_a_matter_of_chance_only_if_they_are(scene_of):
     reasons = set()
     for count, seeds in ((12, range(8)), (100, range(4))):

@@ -230,7 +230,8 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
         best = e.best.support(bound)
         if e.run is None or best > e.run.support(bound):
             fewer = ", fewer than with the true one" if truth is not None and truth.exact.support(bound) > best else ""
-            yield f"{_finder(trace, best)} a pose that {best} agree with{fewer}."
+            finder = "Before refinement the run had" if _had_best(trace, best) else "A longer search finds"
+            yield f"{finder} a pose that {best} agree with{fewer}."
         if np.isfinite(e.position_sd_m):
             fixed = f"{_distance(e.position_sd_m, trace.problem.unit)} and {_deg(e.rotation_sd_rad)}"
             yield f"The {best} fix their pose to {fixed} (1 sd)."
@@ -253,10 +254,10 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
         yield from _truths(trace, e, truth)
 
 
-def _finder(trace: Trace, best: int) -> str:
-    """What found a pose that more agree with than with the run's: its own search, where refinement went on from it."""
-    known = trace.certificate is not None and best <= trace.certificate.lower_bound
-    return "Before refinement the run had" if known else "A longer search finds"
+def _had_best(trace: Trace, best: int) -> bool:
+    """Whether the run's own search found a pose that so many, more than with the run's, agree with: refinement went on
+    from it."""
+    return trace.certificate is not None and best <= trace.certificate.lower_bound
 
 
 def _proofs(trace: Trace, certificate: Certificate | None) -> Iterator[str]:
@@ -283,6 +284,11 @@ def _truths(trace: Trace, e: Evidence, truth: Truth) -> Iterator[str]:
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         error = f"{_distance(metrics.translation_error_m, trace.problem.unit)} and {metrics.rotation_error_deg:.3g}°"
         yield f"Truth: the run's pose is off by {error}; the known gravity by {_deg(truth.exact.tilt_rad)}."
+    best = 0 if e.best is None else e.best.support(e.bound_px)
+    if e.best is not None and (e.run is None or best > e.run.support(e.bound_px)):
+        turn, distance = apart(e.best.cam_from_map, truth.exact.cam_from_map)
+        which = "before refinement" if _had_best(trace, best) else "of the longer search"
+        yield f"Truth: the pose {which} is off by {_distance(distance, trace.problem.unit)} and {_deg(turn)}."
 
 
 def _deg(angle_rad: float) -> str:

@@ -43,6 +43,8 @@ MAX_WORKERS = 64
 AHEAD = 1
 """Number of tasks that are queued besides those that are being done, so that no worker has to wait."""
 MAX_FAILED_STARTS = 2
+START_S = 120.0
+"""Longest time that the first process may take to start."""
 NICENESS = 10
 """Niceness of the worker processes: a sweep in the background must not slow down other work on this machine."""
 
@@ -140,18 +142,33 @@ class LocalWorkers:
         return self._workers + AHEAD - len(self._tasks)
 
     def submit(self, jobs: tuple[Job, ...]) -> None:
-        """Have a worker do these jobs as one task; does not wait."""
+        """Have a worker do these jobs as one task; does not wait.
+
+        Raises ``InputError`` if no process can be started.
+        """
         try:
             with _deaf_to_ctrl_c():
                 future = self._pool.submit(solve, self._plan, jobs, self._keep)
         except BrokenExecutor as error:  # noticed before ``collect``
             future = Future()
             future.set_exception(error)
+        except OSError as error:  # a further process is started when there is work for it
+            raise _not_started(error) from None
         self._tasks[future] = jobs
 
     def collect(self, timeout_s: float) -> list[Done]:
-        """Tasks that ended since the last call; waits at most ``timeout_s`` seconds for the first one."""
+        """Tasks that ended since the last call; waits at most ``timeout_s`` seconds for the first one.
+
+        Raises ``InputError`` if the first process does not start in time.
+        """
         ended, _ = wait(self._tasks, timeout_s, FIRST_COMPLETED)
+        if not self._begun.done() and time.monotonic() - self._started > START_S:
+            for process in dict(self._pool._processes or {}).values():
+                process.kill()  # it does not listen to the lifeline yet
+            raise InputError(
+                f"no worker process has started within {START_S:.0f} s; see whether other programs keep the machine "
+                "busy, then start the sweep again."
+            )
         if any(_is_broken(future) for future in ended):
             ended = set(self._tasks)  # those that have a result keep it
             self._replace()
@@ -166,15 +183,13 @@ class LocalWorkers:
         spawn = multiprocessing.get_context("spawn")  # the page has threads, which a fork would break
         reader, self._lifeline = spawn.Pipe(duplex=False)
         try:
+            self._started = time.monotonic()
             self._pool = ProcessPoolExecutor(self._workers, spawn, _begin, (reader,))
             with _deaf_to_ctrl_c():
                 self._begun = self._pool.submit(os.getpid)
         except OSError as error:
             self._lifeline.close()
-            raise InputError(
-                f"the worker processes cannot be started ({reason(error)}); see whether /dev/shm can be written and "
-                "how many processes are allowed."
-            ) from None
+            raise _not_started(error) from None
 
     def _replace(self) -> None:
         begun = _result(self._begun) is not None
@@ -182,10 +197,17 @@ class LocalWorkers:
         if self._failed_starts == MAX_FAILED_STARTS:
             raise InputError(
                 "the worker processes end while they start: in a script, call this under "
-                "'if __name__ == \"__main__\":', else see whether the memory is full."
+                "'if __name__ == \"__main__\":', else see whether the memory is full and what the terminal says."
             )
         self.close()
         self._start()
+
+
+def _not_started(error: OSError) -> InputError:
+    return InputError(
+        f"the worker processes cannot be started ({reason(error)}); see whether /dev/shm can be written and how many "
+        "processes are allowed."
+    )
 
 
 def _begin(lifeline: Connection) -> None:

@@ -21,6 +21,8 @@ TERMS: dict[str, str] = {
     "none, so it has up to two arcs.",
     "ball": "All camera positions that two matches allow, once the yaw is known: around the point where their rays "
     "come nearest to each other, as far as noise can move it.",
+    "effort": "How much work the exact search does before it ends, or stops with a gap: counted, so that the same "
+    "problem always ends at the same place.",
     "edge": "Two nodes of a graph that agree: two balls that overlap, or two matches that can both be right.",
     "graph": "Nodes and the edges between those that agree. For the position, nodes are balls.",
     "clique": "Nodes that all agree with each other: balls of which any two overlap.",

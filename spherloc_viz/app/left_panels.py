@@ -97,7 +97,8 @@ class LeftPanels:
     ) -> None:
         """Show a step of a run, in the views that are to be seen. ``selected`` are numbers in the problem; ``hidden``
         says that what came out is not to be told: then run and picture are without it. ``offered`` is HTML that says
-        which answers are hidden, and ``cause`` what is wrong with the run and, at its last step, a sentence on that."""
+        which answers are hidden, and ``cause`` what is wrong with the run and, at its last step, a sentence on
+        where its query was taken."""
         kept: NDArray = run.kept
         tables = [table for table in picture.tables if table.name != outcome.name]
         self.steps.show(picture.step, playing, tables)
@@ -198,9 +199,10 @@ class LeftPanels:
         """Tell the page that presses are handled from now on; in a panel that stays when the other one is folded."""
         self._ready.content = READY
 
-    def diagnose(self, html: str) -> None:
-        """Show the newest diagnosis."""
-        update_widget(self._diagnosis, content=html)
+    def diagnose(self, above: str, below: str) -> None:
+        """Show HTML of the newest diagnosis, above and below the words of the step."""
+        update_widget(self.steps.cause, content=above)
+        update_widget(self._diagnosis, content=below)
 
 
 def _yaw_chart(picture: Picture, hidden: bool) -> Chart | None:

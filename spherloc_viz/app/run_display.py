@@ -25,7 +25,7 @@ from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.plots.graph_view import CLIQUE_STEP
 from spherloc_viz.app.stage.canvas import Canvas, panel_widths_px, text_scale
 from spherloc_viz.app.stage.subjects import walk_at_end
-from spherloc_viz.app.text import diagnosis_html, hidden_html, key_step_html, status_html, summary_of
+from spherloc_viz.app.text import cause_html, evidence_html, hidden_html, key_step_html, status_html, summary_of
 from spherloc_viz.app.web.touch import Touch, Touches, pixels_of
 from spherloc_viz.app.web.viser_internals import changes_of, sent_at_once, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
@@ -228,12 +228,11 @@ class RunDisplay:
             outcome = self._outcome_of(trace, known_judgement(known.trace))
             offered = hidden_html(withheld, not presenter) if withheld else ""
             where = self._where(run) if last and not hidden else ""
-            cause = "", where
-            if diagnosis is not None and diagnosis.doubtful:
-                cause = str(diagnosis.cause), f"{diagnosis.summary} {where}".strip() if last else ""
-            self.panels.draw(run, plain, pause is not None, outcome, selected, not told, offered, cause)
-            self.panels.diagnose("" if hidden else _diagnosed_html(trace, diagnosis, index))
-            self.card.draw(trace, selected, run.kept, alternative, self.canvas.clicked_left, not told)
+            cause = str(diagnosis.cause) if diagnosis is not None and diagnosis.doubtful else ""
+            self.panels.draw(run, plain, pause is not None, outcome, selected, not told, offered, (cause, where))
+            self.panels.diagnose(*("", "") if hidden else _diagnosed_html(trace, diagnosis, index))
+            right = partial(self.canvas.card_is_right, drawn)
+            self.card.draw(trace, selected, run.kept, alternative, right, not told)
         nearest = sorted(range(len(timeline)), key=lambda other: (abs(other - index), index - other))
         self._to_prepare = deque(
             partial(self._paint_ahead, run, other, selected, told) for other in nearest[1 : 1 + MAX_AHEAD]
@@ -361,15 +360,20 @@ class RunDisplay:
             set_theme(self._client.gui, theme)
 
 
-def _diagnosed_html(trace: Trace, diagnosis: Diagnosis | None, index: int) -> str:
-    """What the step at ``index`` says of a run's diagnosis, which is None until there is one: the last step says it,
-    those before it where to look, since nothing that the cause speaks of has been shown there."""
+def _diagnosed_html(trace: Trace, diagnosis: Diagnosis | None, index: int) -> tuple[str, str]:
+    """What the step at ``index`` says of a run's diagnosis, above and below its own words; the diagnosis is None until
+    there is one. The last step says it, those before it where to look, since nothing that the cause speaks of has
+    been shown there."""
     timeline = steps(trace)
     if index == len(timeline) - 1:
-        return status_html("Diagnosing …") if diagnosis is None else diagnosis_html(diagnosis)
+        return (
+            ("", status_html("Diagnosing …"))
+            if diagnosis is None
+            else (cause_html(diagnosis), evidence_html(diagnosis))
+        )
     if diagnosis is None or not diagnosis.doubtful:
-        return ""
+        return "", ""
     # Of a run that succeeded, the key step is where its consensus was found.
     success = evaluate(trace).success
     key = len(timeline) - 1 if success else key_step(trace, diagnosis)
-    return key_step_html(timeline, key, index, success is False)
+    return "", key_step_html(timeline, key, index, success is False)

@@ -72,21 +72,29 @@ def table_html(table: Table, name_html: Callable[[str], str] = escape) -> str:
     return box(f'<table style="border-collapse:collapse;width:100%"><tr>{head}</tr>{rows}</table>')
 
 
-def diagnosis_html(diagnosis: Diagnosis) -> str:
-    """Cause, summary, evidence and advice; of a run that looks right, the summary alone."""
+def cause_html(diagnosis: Diagnosis) -> str:
+    """Cause, summary and advice; nothing of a run that looks right."""
+    if not diagnosis.doubtful:
+        return ""
+    color = style.css_text(style.OUTLIER)
+    return box(
+        f'<div class="diagnosis-words"><div style="font-weight:600;color:{color}">'
+        f"{escape(diagnosis.cause.capitalize())}</div><div>{escape(diagnosis.summary)}</div></div>"
+        f'<div style="padding-top:.25em">{escape(_by_label(diagnosis.advice))}</div>'
+    )
+
+
+def evidence_html(diagnosis: Diagnosis) -> str:
+    """The evidence for the cause, and whether it was judged with the truth; of a run that looks right, the summary."""
     if not diagnosis.doubtful:
         return box(f'<div style="{DIM}">{escape(diagnosis.summary)}</div>', "font-size:12px")
-    color = style.css_text(style.OUTLIER)
     evidence = "".join(f'<li style="padding-bottom:.2em">{escape(line)}</li>' for line in diagnosis.evidence)
     known = "Judged with the truth." if diagnosis.used_truth else "Judged without the truth."
     parts = [
-        f'<div class="diagnosis-words"><div style="font-weight:600;color:{color}">'
-        f"{escape(diagnosis.cause.capitalize())}</div><div>{escape(diagnosis.summary)}</div></div>",
-        f'<ul style="margin:.4em 0;padding-left:1.2em;font-size:12px">{evidence}</ul>' if evidence else "",
-        f"<div>{escape(_by_label(diagnosis.advice))}</div>",
-        f'<div style="font-size:12px;padding-top:.35em;{DIM}">{known}</div>',
+        f'<div>Evidence</div><ul style="margin:.2em 0;padding-left:1.2em">{evidence}</ul>' if evidence else "",
+        f'<div style="{DIM}">{known}</div>',
     ]
-    return box("".join(parts))
+    return box("".join(parts), "font-size:12px")
 
 
 def key_step_html(steps: Sequence[StepHeading], key: int, here: int, failed: bool) -> str:
@@ -168,8 +176,9 @@ def summary_of(trace: Trace) -> tuple[str, list[str]]:
     return verdict(trace, metrics.success), facts
 
 
-def summary_html(trace: Trace, cause: str = "", why: str = "") -> str:
-    """A run in one line; ``cause`` is what is wrong with it, if that is to be told, and ``why`` a sentence on that."""
+def summary_html(trace: Trace, cause: str = "", where: str = "") -> str:
+    """A run in one line; ``cause`` is what is wrong with it, if that is to be told, and ``where`` a sentence on where
+    its query was taken."""
     words, facts = summary_of(trace)
     doubt = ", but in doubt" if cause and words == "success" else ""
     told = f"{words.capitalize()}{doubt}: {cause}" if cause else words.capitalize()
@@ -181,7 +190,7 @@ def summary_html(trace: Trace, cause: str = "", why: str = "") -> str:
         for fact in facts
     )
     line = f'<b style="{_value_css(words)}">{escape(told)}</b> · ' + " · ".join(shown)
-    return box(line + (f"<div>{escape(why)}</div>" if why else ""), "font-size:12.5px;padding-top:.2em")
+    return box(line + (f"<div>{escape(where)}</div>" if where else ""), "font-size:12.5px;padding-top:.2em")
 
 
 def _value_css(value: object) -> str:

@@ -114,8 +114,8 @@ def _effort(stage: ConsensusStage) -> str:
         if stage.finished
         else "the budget ran out before every yaw was searched, so that the bound is larger than it might be."
     )
-    what = "words of bitsets and tests of a match" if stage.arcs else "tests of a match"
-    return f"Effort: {stage.effort:,} {what}; {end}"
+    what = "operations on sets of matches" if stage.arcs else "tests of a match"
+    return f"The effort of the search, {stage.effort:,} {what}: {end}"
 
 
 def _peak(view: RunView, stage: ConsensusStage, rank: int, place: int, peaks: int) -> Frame:

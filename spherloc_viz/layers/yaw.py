@@ -351,7 +351,7 @@ def counts_chart(view: RunView, counts: np.ndarray, yaw_rad: float | None = None
     """Overlap count over yaw, with the truth and an estimate if there is one."""
     peak = float(counts.max(initial=1))
     curves = [ring.step_curve("that overlap", counts), *ring.markers(view, peak, yaw_rad)]
-    return Chart("yaw", "Arcs that overlap at each yaw", "yaw (°)", "arcs", tuple(curves))
+    return Chart("yaw", "Arcs that overlap at each yaw", "yaw (°)", "number of arcs", tuple(curves))
 
 
 def chart(view: RunView, stage: YawStage, found: bool = False, candidate_rad: float | None = None) -> Chart:

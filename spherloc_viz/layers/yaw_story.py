@@ -57,7 +57,7 @@ def yaw_story(trace: Trace) -> YawStory:
     note = ""
     title, y_label = "No stage of this run looked at the yaw", "matches"
     if yaw is not None:
-        title, y_label = "Arcs that overlap at each yaw", "arcs"
+        title, y_label = "Arcs that overlap at each yaw", "number of arcs"
         curves = (ring.step_curve("that overlap", yaw.overlap),)
         estimate = float(np.degrees(yaw.yaw_rad)) if estimate is None else estimate
     elif exact is not None:

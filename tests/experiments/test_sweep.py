@@ -2,11 +2,13 @@
 
 import errno
 import multiprocessing
+import multiprocessing.spawn
 import os
 import signal
 import subprocess
 import sys
 import threading
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -167,6 +169,36 @@ def test_a_machine_that_starts_no_workers_is_a_sentence(tmp_path: Path, monkeypa
     monkeypatch.setattr(sweep, "ProcessPoolExecutor", read_only)
     with pytest.raises(InputError, match=r"cannot be started \(Read-only file system\); see whether /dev/shm"):
         list(run_sweep(small_plan(tmp_path)))
+
+
+def test_a_machine_that_starts_one_worker_and_no_more_is_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Further processes are started when there is work for them."""
+
+    def submit(self: ProcessPoolExecutor, job: object, *words: object) -> Future:
+        if job is sweep.solve:
+            raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+        return started(self, job, *words)  # type: ignore[arg-type]
+
+    started = ProcessPoolExecutor.submit
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", submit)
+    with pytest.raises(InputError, match=r"cannot be started \(Resource temporarily unavailable\); see whether"):
+        list(run_sweep(small_plan(tmp_path)))
+
+
+def test_workers_that_do_not_come_are_a_sentence_and_are_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asleep = tmp_path / "python"
+    asleep.write_text("#!/bin/sh\nexec sleep 600\n")
+    asleep.chmod(0o755)
+    monkeypatch.setattr(sweep, "START_S", 0.5)
+    before = multiprocessing.spawn.get_executable()
+    multiprocessing.set_executable(str(asleep))
+    try:
+        with pytest.raises(InputError, match="no worker process has started within"):
+            list(run_sweep(small_plan(tmp_path)))
+    finally:
+        multiprocessing.set_executable(before)
 
 
 def test_a_run_that_always_kills_its_worker_is_named(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """The panel right of the canvas: its tabs Play, Compare, Sweep, Open, Recordings and Share."""
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from html import escape
@@ -19,6 +19,7 @@ from spherloc.types import FloatArray
 from spherloc.watch import Watch
 from spherloc_viz import share, style
 from spherloc_viz.app.catalog import Catalog, Run, RunRequest, SceneRequest
+from spherloc_viz.app.controls.choices import choices_html, preset_names, story_html
 from spherloc_viz.app.controls.estimator_controls import EstimatorControls
 from spherloc_viz.app.controls.presets import Preset, presets
 from spherloc_viz.app.controls.scene_controls import SceneControls
@@ -33,9 +34,9 @@ from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.review.reviewer import ReviewCard
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage import views
-from spherloc_viz.app.text import DIM, box
+from spherloc_viz.app.text import box
 from spherloc_viz.app.web.touch import Touches
-from spherloc_viz.app.web.viser_internals import at_once, put
+from spherloc_viz.app.web.viser_internals import at_once, put, update_widget
 from spherloc_viz.app.workers import LatestWorker
 from spherloc_viz.layers.primitives import SceneItem
 from spherloc_viz.layers.scene import trajectory_items
@@ -128,25 +129,6 @@ class DisplayControls:
     def _press(self, event: viser.GuiEvent) -> None:
         self._wanted = event.target.value
         self._changed(event)
-
-
-NO_PRESET = "choose …"
-
-
-def preset_names(known: Sequence[Preset], hidden: bool) -> tuple[str, ...]:
-    """What the list of presets offers, nothing first; ``hidden`` numbers them, since their titles tell what happens."""
-    titles = (f"Preset {number}" if hidden else preset.title for number, preset in enumerate(known, 1))
-    return (NO_PRESET, *titles)
-
-
-def story_html(preset: Preset, changed: bool) -> str:
-    """A preset's story and estimator, dimmed if the page was ``changed`` since. Both take the same room, that of the
-    longer text."""
-    story = f"{preset.story} Estimator: {preset.estimator}."
-    after = f"Changed from the preset {preset.title}: {story}"
-    texts = ((after, DIM),) if changed else ((after, "visibility:hidden"), (story, ""))
-    words = "".join(f'<div style="grid-area:1/1;{look}">{escape(text)}</div>' for text, look in texts)
-    return box(f'<div style="display:grid">{words}</div>', "font-size:12px")
 
 
 UNDO, REDO, NEW_SEED = "Undo", "Redo", "New seed"
@@ -247,6 +229,7 @@ class Controls:
             hint="Each sets a scene, an estimator and its options, and shows one thing.",
         )
         self._preset.on_update(self._choose_preset)
+        self._choices = gui.add_html("")
         self._story = gui.add_html("", visible=False)
         self.scene = SceneControls(gui, self._catalog, self._owner.changed)
         self._movable = gui.add_checkbox("Drag the camera", False, hint="Handles on the true camera move and turn it.")
@@ -333,6 +316,7 @@ class Controls:
         elif self._told is not None and self._told.scene.scene != request.scene.scene:
             self._told = None
         html = "" if hidden or self._told is None else story_html(self._told, changed=place == 0)
+        update_widget(self._choices, content=choices_html(self._presets, self._catalog, hidden))
         if self._story.content != html:
             self._story.content, self._story.visible = html, bool(html)
 

@@ -27,7 +27,7 @@ START = "mc"
 SLIDERS: Mapping[str, tuple[str, float, float, float]] = {
     "bound_px": (OPTIONS["bound_px"], 0.5, 20.0, 0.5),
     "noise_px": (OPTIONS["noise_px"], 0.1, 5.0, 0.1),
-    "max_balls": ("Most balls", 10, 1000, 10),
+    "max_balls": ("Max. balls", 10, 1000, 10),
 }
 """Label, least, most and step of options that are best dragged."""
 PRESETS: Mapping[str, tuple[str, Mapping[str, float | None]]] = {

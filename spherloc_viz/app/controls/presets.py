@@ -23,6 +23,8 @@ class Preset:
     """Registered name."""
     options: Any
     """The estimator's options dataclass."""
+    fails: bool
+    """Whether the run's pose is wrong."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class _Recipe:
     variation: Variation = field(default_factory=Variation)
     estimator: str = "mc-exact"
     options: Mapping[str, Any] = field(default_factory=dict)
+    fails: bool = True
 
 
 RECIPES = (
@@ -46,6 +49,7 @@ RECIPES = (
         "panorama_outliers_80",
         0,
         Variation(correspondences=60, noise_px=0.5, outlier_rate=0.3),
+        fails=False,
     ),
     _Recipe(
         "Paper Fig. 6 at 90 %",
@@ -54,6 +58,7 @@ RECIPES = (
         "mei_outliers_90",
         0,
         estimator="mc",
+        fails=False,
     ),
     _Recipe(
         "RANSAC bad luck",
@@ -112,6 +117,7 @@ def presets(catalog: Catalog) -> tuple[Preset, ...]:
             SceneRequest(labels[paths[recipe.scene]], recipe.seed, None, recipe.variation),
             recipe.estimator,
             options_type(recipe.estimator)(**recipe.options),
+            recipe.fails,
         )
         for recipe in RECIPES
         if paths.get(recipe.scene) in labels

@@ -49,9 +49,11 @@ class StepsPanel:
         self._stages = gui.add_html("")
         self._slider = gui.add_slider("Timeline", 1, 2, 1, 1, marks=())
         self._buttons = gui.add_button_group("Keys B, N, P", (PREVIOUS, NEXT, PLAY))
+        self.cause = gui.add_html("")
+        """Just above what the step says: what a reader should not have to scroll to."""
         self._text = gui.add_html("")
         self.remark = gui.add_html("")
-        """Just below what the step says."""
+        """Just below it."""
         self._choice = gui.add_dropdown("Step", titles)
         self._pace = gui.add_dropdown("Pace", tuple(PACES), hint="How fast the steps play.")
         self._slider.on_update(self._slide)

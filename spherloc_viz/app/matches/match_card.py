@@ -1,5 +1,6 @@
 """The card about the selected matches: whether the run kept them and why, and how they can be changed."""
 
+from collections.abc import Callable
 from html import escape
 from pathlib import Path
 
@@ -64,7 +65,8 @@ def _crop_html(path: Path | None, pixel: FloatArray, name: str) -> str:
     )
 
 
-WIDTH_PX = 310.0
+WIDTH_PX, HEIGHT_PX = 310.0, 290.0
+"""Width of the card, and about its height while it is folded."""
 MARGIN_PX = 8.0
 
 
@@ -101,12 +103,12 @@ class MatchCard:
         selected: tuple[int, ...],
         kept: NDArray,
         alternative_cam_from_map: FloatArray | None = None,
-        right: bool = False,
+        right: Callable[[float, float], bool] = lambda width_px, height_px: False,
         hidden: bool = False,
     ) -> None:
-        """Show the selected matches, indices in the problem; ``kept`` (N,) are their original numbers. ``right`` says
-        whether the card is put on the right of the canvas when it opens or its matches change, so that it does not
-        cover a click on the left.
+        """Show the selected matches, indices in the problem; ``kept`` (N,) are their original numbers. ``right`` is
+        asked, when the card opens or its matches change, whether one of that width and height, px, belongs on the right
+        of the canvas.
 
         ``alternative_cam_from_map`` (3, 4) is another pose from a diagnosis, with which a match is compared. ``hidden``
         leaves out whether the run kept the matches.
@@ -125,8 +127,9 @@ class MatchCard:
         )
         if not selected or (self._drawn is not None and self._drawn[0] is trace and self._drawn[1:] == drawn[1:]):
             return
-        if right != self._right:
-            self._right = right
+        belongs_right = right(self._width_px, HEIGHT_PX * self._width_px / WIDTH_PX)
+        if belongs_right != self._right:
+            self._right = belongs_right
             self._place()
         self._drawn = drawn
         if hidden:

@@ -442,8 +442,8 @@ def bars_html(bars: ArcBars) -> str:
         f" {bars.kinds[kind]}</span>"
         for kind in kinds
     )
-    look = "font-size:12px;display:flex;flex-wrap:wrap;column-gap:.9em;padding-bottom:.2em"
-    return f'<div style="{look}">pairs: {samples}</div>' if kinds else ""
+    look = "font-size:12px;display:flex;flex-wrap:wrap;column-gap:.5em;padding-bottom:.2em"
+    return f'<div style="{look}">arcs of pairs: {samples}</div>' if kinds else ""
 
 
 def caption(trace: Trace, story: YawStory, arcs: PairArcs, bars: ArcBars) -> str:

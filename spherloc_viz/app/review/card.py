@@ -83,7 +83,7 @@ def _card(parts: Sequence[str]) -> str:
 def _title(title: str, row: RunRow, told: bool = True) -> str:
     """A heading; unless answers are ``told``, without the name of the file, which has the problem's."""
     return (
-        f'<div style="font-weight:600;padding-top:.3em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis" '
+        f'<div style="font-weight:600;padding-top:.3em;overflow-wrap:anywhere" '
         f'title="{escape(row.file) if told else ""}">{escape(title)}'
         f'<span style="font-weight:400;{DIM}"> · {escape(row.estimator)} #{row.seed}</span></div>'
     )

@@ -22,7 +22,7 @@ PREVIOUS_KEY, NEXT_KEY = "[", "]"
 """Open the run before and the next one: viser's canvas has letters and arrows."""
 RULE = "border-top:1px solid rgba(128,140,160,.18)"
 CUT = "white-space:nowrap;overflow:hidden;text-overflow:ellipsis"
-TWO_LINES = "max-height:2.7em;overflow:hidden;overflow-wrap:anywhere"
+WHOLE = "overflow-wrap:anywhere"
 OPENED = "rgba(60,130,230,.2)"
 """Behind the row of the run that is open."""
 
@@ -80,14 +80,14 @@ def _lines(row: RunRow, now: datetime, hidden: bool) -> str:
     """What the run is, what came out, and numbers; below, what a reviewer wrote."""
     title = words.untold_title_of(row) if hidden else words.title_of(row)
     name = (
-        f'<div style="{TWO_LINES}"><span style="{DIM};float:right;padding-left:.5em">'
+        f'<div style="{WHOLE}"><span style="{DIM};float:right;padding-left:.5em">'
         f'{escape(words.moment(row.created, now))}</span><span style="font-weight:600">{escape(title)}</span></div>'
     )
     method = f"{escape(row.estimator)} #{row.seed}"
     if hidden:
         return f'{name}<div style="{CUT};{DIM}">{method} · {row.correspondences} matches</div>'
     changed = f" · {escape(row.changes)}" if row.changes else ""
-    how = f'<div style="{CUT}">{verdict_html(row)}<span style="{DIM}"> · {method}{changed}</span></div>'
+    how = f'<div style="{WHOLE}">{verdict_html(row)}<span style="{DIM}"> · {method}{changed}</span></div>'
     facts = [f"{row.inliers}/{row.correspondences}"]
     estimated = "est. " if row.rotation_error_deg is None else ""  # by the front end, before the run
     facts += [] if row.outlier_rate is None else [f"{estimated}{100.0 * row.outlier_rate:.0f} % out"]

@@ -205,25 +205,39 @@ class Canvas:
 
     def _cut(self, picture: Picture, position: np.ndarray) -> frozenset[str]:
         """Names of the labels that the canvas' edge would cut for a viewer at that position (3,)."""
+        view = self._view_from(position)
+        return frozenset() if view is None else views.cut(picture, view, self._aspect(), self._letter())
+
+    def _view_from(self, position: np.ndarray) -> views.Viewpoint | None:
+        """The view of a viewer at that position (3,); None if what the page sent is none."""
         camera = self._client.camera
         try:
             target, angle = np.array(camera.look_at, dtype=np.float64).reshape(3), float(camera.fov)
         except (TypeError, ValueError):
-            return frozenset()
+            return None
         away = target - position
         if not (0.0 < angle < np.pi and 0.0 < np.hypot(away[0], away[2]) < np.inf):  # a page may send anything
-            return frozenset()
-        return views.cut(picture, views.Viewpoint(position, target, angle), self._aspect(), self._letter())
+            return None
+        return views.Viewpoint(position, target, angle)
 
     def _letter(self) -> float:
         """Width of a letter in the canvas, as a share of half the canvas' height."""
         height_px = max(1, min(self._client.camera.image_height, MAX_PX))
         return views.LETTER_PX * self._label_scale / (0.5 * height_px)
 
-    @property
-    def clicked_left(self) -> bool:
-        """Whether the last click on the canvas was in its left half."""
-        return self._painter.clicked_x < 0.5
+    def card_is_right(self, picture: Picture, width_px: float, height_px: float) -> bool:
+        """Whether a card of that size hides less of the selection and of the labels at the upper right of the canvas
+        than at its upper left; where it is the same, whether the last click was in the left half."""
+        view = self._view_from(np.array(self._client.camera.position, dtype=np.float64))
+        if view is None:
+            return self._painter.clicked_x < 0.5
+        aspect, half_px = self._aspect(), 0.5 * max(1, min(self._client.camera.image_height, MAX_PX))
+        width, height = width_px / half_px, height_px / half_px
+        left, right = (
+            views.covered(picture, view, np.array([x, 1.0 - height]), np.array([x + width, 1.0]), self._letter())
+            for x in (-aspect, aspect - width)
+        )
+        return right < left if right != left else self._painter.clicked_x < 0.5
 
     def check(self) -> float | None:
         """Seconds until the next check of whether the page dropped its first view; None if no more checks are

@@ -149,6 +149,24 @@ def cut(picture: Picture, view: Viewpoint, aspect: float, letter: float) -> froz
     return frozenset(label.name for k, label in enumerate(labels) if k not in shown)
 
 
+def covered(picture: Picture, view: Viewpoint, low: FloatArray, high: FloatArray, letter: float) -> float:
+    """How much of what matters a card would cover that lies over the canvas from ``low`` to ``high``, (2,) each, right
+    and up from its middle in halves of its height: the shares of the selected dots and lines, and a tenth for each
+    label, of letters so wide."""
+    zoom, hidden = np.tan(view.field_of_view_rad / 2), 0.0
+    for item in picture.scene:
+        if item.layer == "selection" and isinstance(item, Points | Segments):
+            places = item.positions if isinstance(item, Points) else item.points.reshape(-1, 3)
+            seen = projected(view, places) / zoom
+            hidden += float(((seen >= low) & (seen <= high)).all(axis=1).mean()) if len(seen) else 0.0
+    labels = [item for item in picture.scene if isinstance(item, Label)]
+    if labels:
+        seen = projected(view, np.array([label.position for label in labels])) / zoom
+        halves = _half_sizes(labels, letter)
+        hidden += 0.1 * int(np.count_nonzero(((seen + halves >= low) & (seen - halves <= high)).all(axis=1)))
+    return hidden
+
+
 def _names(picture: Picture, subject: FloatArray) -> list[Label]:
     """The labels beside a subject (K, 3)."""
     low, high = np.min(subject, axis=0), np.max(subject, axis=0)

@@ -64,7 +64,7 @@
 
   // Only what is new is written: a screen reader would read it again.
   function fill() {
-    const told = [".match-words", ".step-words", ".diagnosis-words", ".offered-words"]
+    const told = [".match-words", ".diagnosis-words", ".step-words", ".offered-words"]
       .filter((kind) => narrow() || kind !== ".match-words")
       .map((kind) => [kind, document.querySelector(kind)?.innerHTML])
       .filter(([, html]) => html)
@@ -72,11 +72,11 @@
       .join("");
     if (words.dataset.told === told) return;
     number.textContent = document.querySelector(".step-title")?.dataset.place ?? "";
-    const match = (html) => html?.split("<div class=\"of-step-words\">")[0];
+    const match = (html) => html?.split(/<div class="of-(?:diagnosis|step)-words">/)[0];
     const walked = match(words.dataset.told) === match(told);
     words.dataset.told = told;
     words.innerHTML = told;
-    words.scrollTop = walked ? words.querySelector(".of-step-words").offsetTop - words.offsetTop : 0;
+    words.scrollTop = walked ? words.querySelector(".of-diagnosis-words,.of-step-words").offsetTop - words.offsetTop : 0;
   }
 
   function markEnds() {
