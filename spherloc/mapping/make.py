@@ -18,7 +18,7 @@ from spherloc.mapping.new_images import NewImages
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.positions import Positions, gps_of_images
 from spherloc.mapping.reconstruction import DATABASES, reconstruct
-from spherloc.mapping.rig import Shots, disagree, shots_of, went_apart
+from spherloc.mapping.rig import Shots, disagree, misfits, shots_of, went_apart
 from spherloc.mapping.scene_files import SCENE
 from spherloc.mapping.stated_gravity import StatedGravity
 from spherloc.mapping.upright import (
@@ -216,11 +216,14 @@ def _finished(
     measured: ScaleMeasurement,
     tell: Tell,
 ) -> tuple[Reconstruction, Level, MapScale]:
-    """A model with images added later and without those whose own gravity disagrees; its gravity and its scale."""
+    """A model with images added later and without those whose own gravity, or what another camera took together with
+    them, disagrees; its gravity and its scale."""
+    shots = shots_of(views)
     made = made.without(level_of(made.poses, gravity).leaning)
+    made = made.without(misfits(made.poses, shots))
     made = place_rest(made, views, elsewhere, gravity, level_of(made.poses, gravity), tell)
     level = level_of(made.poses, gravity)
-    made = made.without(level.leaning)
+    made = made.without(level.leaning.keys() | misfits(made.poses, shots))
     return made, level, scale_of(made, level, measured)
 
 

@@ -265,6 +265,27 @@ def expected_poses(poses: Mapping[str, FloatArray], shots: Shots) -> dict[str, F
     return found
 
 
+def misfits(poses: Mapping[str, FloatArray], shots: Shots) -> set[str]:
+    """Names of images of a map of ``poses`` (3, 4) that stand to those which were taken together with them otherwise
+    than their cameras do at most times: where more of these speak against an image than for it."""
+    balance: Counter[str] = Counter()
+    name_of = {shot: name for name, shot in shots.items()}
+    for first, second in combinations(sorted({camera for camera, _ in shots.values()}), 2):
+        one, other = _together(poses, poses, shots, (first, second))
+        relative = _relative(one, other)
+        if relative is None:
+            continue
+        step_m = _step(_centres(one))
+        both = sorted(_steps(poses, shots, first).keys() & _steps(poses, shots, second).keys())
+        for step, here, there in zip(both, one, other, strict=True):
+            off = np.linalg.norm(camera_centre(_after(relative, here)) - camera_centre(there))
+            turned = rotation_angle(there[:, :3] @ _after(relative, here)[:, :3].T)
+            fits = off <= OFF * step_m and turned <= TURNED_RAD
+            for camera in (first, second):
+                balance[name_of[camera, step]] += 1 if fits else -1
+    return {name for name, count in balance.items() if count < 0}
+
+
 def _relative(one: FloatArray, other: FloatArray) -> FloatArray | None:
     """The pose (3, 4) of the second camera from the first that most of their poses (K, 3, 4) agree on; None if too few
     do."""

@@ -16,6 +16,7 @@ from spherloc.mapping.rig import (
     disagree,
     expected_poses,
     joint_of,
+    misfits,
     one_camera,
     shots_of,
     went_apart,
@@ -145,6 +146,20 @@ def test_an_image_is_expected_where_the_other_camera_says():
         np.testing.assert_allclose(one, true[missing], atol=1e-9)
     assert expected_poses(of(true, "left"), SHOTS) == {}
     assert words(known, SHOTS) == "left and right, by 9 times at which they took images together"
+
+
+def test_an_image_that_stands_elsewhere_than_the_other_cameras_say_is_left_out():
+    true = drive()
+    assert misfits(true, SHOTS) == set()
+    wrong = "left/005.png"
+    moved = true | {wrong: pose(true[wrong][:, :3], true[wrong][:, 3] + [0.0, 0.0, 5.0])}
+    assert misfits(moved, SHOTS) == {wrong, "right/005.png"}, "of two, it is not known which is wrong"
+    third = {
+        name.replace("left", "back"): pose(yaw_rotation(1.0) @ one[:, :3], yaw_rotation(1.0) @ one[:, 3])
+        for name, one in of(true, "left").items()
+    }
+    shots = shots_of(views_of(*true, *third))
+    assert misfits({**moved, **third}, shots) == {wrong}, "of three, two agree"
 
 
 def test_images_taken_together_are_tied():
