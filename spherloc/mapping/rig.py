@@ -57,6 +57,8 @@ def shots_of(views: Sequence[View]) -> Shots:
         return {}
     reference = max(keys, key=lambda camera: len(keys[camera]))
     steps = np.unique(list(keys[reference].values()))
+    if len(steps) < MIN_TOGETHER:
+        return {}
     room = NEAR_IN_TIME * float(np.median(np.diff(steps)))
     found: dict[str, tuple[str, int]] = {}
     for camera, images in keys.items():

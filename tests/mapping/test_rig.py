@@ -90,13 +90,14 @@ def test_images_taken_together_are_told_by_their_names(first, second):
     "views",
     [
         views_of(*numbered("IMG_{:04d}.jpg", range(16))),  # one camera
+        views_of(*[f"{camera}/2024_{word}.jpg" for camera in ("left", "right") for word in "abcdefg"]),
         views_of(*numbered("day1/{:03d}.jpg"), *numbered("day2/{:03d}.jpg", range(6, 14))),
         views_of(*numbered("left/{:03d}.jpg", range(4)), *numbered("right/{:03d}.jpg", range(4))),  # too few
         views_of(*numbered("a/{:03d}.jpg"), *numbered("b/{:03d}.jpg"), camera=Equirectangular(200, 100)),
         views_of(*[f"left/{word}.jpg" for word in "abcdefg"], *[f"right/{word}.jpg" for word in "abcdefg"]),
         views_of(*numbered("a/17000000{:02d}.100000000.png"), *numbered("b/17000000{:02d}.500000000.png")),
     ],
-    ids=["one camera", "other numbers", "few", "panoramas", "no numbers", "other times"],
+    ids=["one camera", "same number", "other numbers", "few", "panoramas", "no numbers", "other times"],
 )
 def test_other_images_are_not_taken_together(views):
     assert shots_of(views) == {}
