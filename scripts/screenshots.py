@@ -30,7 +30,7 @@ APARTMENT, CAMPUS = "scenes/apartment_night_panorama.toml", "scenes/campus_panor
 PATIENCE_MS = 240_000
 JPEG = (cv2.IMWRITE_JPEG_QUALITY, 80, cv2.IMWRITE_JPEG_OPTIMIZE, 1)
 """With less quality small words get fringes."""
-STILL_S = 4.0
+STILL_S = 8.0
 """How long the page may go on changing before it is photographed all the same."""
 ROUNDING = 3
 """Largest difference of a colour, of 255, between two photographs of a page that stands still."""
