@@ -33,6 +33,10 @@ MIN_FITTING = 0.6
 OFF, TURNED_RAD = 0.5, float(np.radians(5.0))
 """A pair of images taken together fits if it is no farther apart than this share of a step of the way, and if one
 camera is turned against the other as in other pairs."""
+ALIKE = 1.0 + 2.0 * float(np.cos(TURNED_RAD))
+"""Least trace of a rotation by no more than that angle."""
+MAX_TRIED = 150
+"""Most times of which all pairs are tried, a second's work."""
 MIN_WAY = 3.0
 """Least extent, in steps, of the way on which they fit."""
 APART = 1.0
@@ -132,10 +136,11 @@ def joint_of(
         wrong = {both[k] for k in np.flatnonzero(~fits).tolist()}
         misfits = {name for name, (camera, step) in shots.items() if camera in (first, second) and step in wrong}
         moved = {}
-        for name in others.keys() - misfits:
-            rotation = others[name][:, :3] @ other_to_level.T @ turn.T @ to_level
-            centre = to_level.T @ (scale * turn @ other_to_level @ camera_centre(others[name]) + shift)
-            moved[name] = pose(rotation, -rotation @ centre)
+        for name, there in others.items():  # in their order, on which COLMAP's map depends
+            if name not in misfits:
+                rotation = there[:, :3] @ other_to_level.T @ turn.T @ to_level
+                centre = to_level.T @ (scale * turn @ other_to_level @ camera_centre(there) + shift)
+                moved[name] = pose(rotation, -rotation @ centre)
         most, best = int(fits.sum()), Joint(moved, frozenset(misfits & poses.keys()))
     return best
 
@@ -149,7 +154,7 @@ def _turned(to_level: FloatArray) -> FloatArray:
 
 def _steps(poses: Mapping[str, FloatArray], shots: Shots, camera: str) -> dict[int, FloatArray]:
     """Poses (3, 4) of a camera's images by their time step."""
-    return {shots[name][1]: pose for name, pose in poses.items() if name in shots and shots[name][0] == camera}
+    return {shots[name][1]: one for name, one in poses.items() if name in shots and shots[name][0] == camera}
 
 
 def _together(
@@ -159,7 +164,8 @@ def _together(
     of time."""
     here, there = _steps(poses, shots, cameras[0]), _steps(others, shots, cameras[1])
     both = sorted(here.keys() & there.keys())
-    return tuple(np.array([one[step] for step in both]).reshape(-1, 3, 4) for one in (here, there))  # pyright: ignore
+    one, other = (np.array([poses[step] for step in both]).reshape(-1, 3, 4) for poses in (here, there))
+    return one, other
 
 
 def _centres(poses: FloatArray) -> FloatArray:
@@ -176,7 +182,8 @@ def _fit(one: FloatArray, other: FloatArray) -> tuple[float, FloatArray, FloatAr
     """Scale, rotation (3, 3) about the vertical and translation (3,) of a level map to another, from poses (K, 3, 4) in
     both of images that were taken together, and which of these fit (K,); None if too few do.
 
-    All pairs of times are tried, each of which fixes a transform; then it is fitted to all that fit the best one.
+    All pairs of ``MAX_TRIED`` times are tried, each of which fixes a transform; then it is fitted to all that fit the
+    best one.
     """
     here, there = _centres(one), _centres(other)
     step = _step(here)
@@ -191,7 +198,8 @@ def _fit(one: FloatArray, other: FloatArray) -> tuple[float, FloatArray, FloatAr
         return int(fits.sum()), -float(off[fits].sum()), fits
 
     best, fits = (0, 0.0), np.zeros(len(here), np.bool_)
-    for i, j in combinations(range(len(here)), 2):
+    tried = np.unique(np.linspace(0, len(here) - 1, min(len(here), MAX_TRIED)).round().astype(int)).tolist()
+    for i, j in combinations(tried, 2):
         transform = _laid_over(here[[i, j]], there[[i, j]])
         if transform is not None and (found := fitting(transform, i))[:2] > best:
             best, fits = found[:2], found[2]
@@ -219,8 +227,7 @@ def _laid_over(here: FloatArray, there: FloatArray) -> tuple[float, FloatArray, 
 def _turned_alike(one: FloatArray, other: FloatArray, index: int) -> BoolArray:
     """Whether (K,) cameras of poses (K, 3, 4) are turned against each other as those of one pair are."""
     between = other[:, :, :3] @ one[:, :, :3].transpose(0, 2, 1)
-    angles = [rotation_angle(turned @ between[index].T) for turned in between]
-    return np.array(angles) <= TURNED_RAD
+    return np.einsum("kij,ij->k", between, between[index]) >= ALIKE
 
 
 def one_camera(names: Sequence[str], shots: Shots) -> BoolArray:
@@ -296,7 +303,7 @@ def _relative(one: FloatArray, other: FloatArray) -> FloatArray | None:
     turns = other[:, :, :3] @ one[:, :, :3].transpose(0, 2, 1)
     shifts = other[:, :, 3] - np.einsum("kij,kj->ki", turns, one[:, :, 3])
     near = np.linalg.norm(shifts[:, None] - shifts, axis=2) <= OFF * step
-    alike = np.array([[rotation_angle(turn @ base.T) <= TURNED_RAD for turn in turns] for base in turns])
+    alike = np.einsum("kij,lij->kl", turns, turns) >= ALIKE
     best = int(np.argmax((near & alike).sum(axis=1)))
     fits = near[best] & alike[best]
     if fits.sum() < max(MIN_TOGETHER, MIN_FITTING * len(one)):
