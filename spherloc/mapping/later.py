@@ -61,7 +61,7 @@ def place_rest(
     """The map with those left-out images whose pose is accepted; those named in ``elsewhere`` are not tried.
 
     ``gravity`` is that from vertical lines, by the name of the image. Where a camera took an image together with one
-    that is in the map, only matches that fit its expected pose are looked at first.
+    that is in the map, only matches that fit its expected pose are taken.
     """
     names, shots = [view.name for view in views], shots_of(views)
     for round_number in count(1):
