@@ -18,7 +18,7 @@ from spherloc.errors import ProblemError
 from spherloc.estimators import default_options, estimate
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN, transform
-from spherloc.mapping.model import Reconstruction, contradictions, points_of
+from spherloc.mapping.model import Reconstruction, SeenPoints, contradictions, points_of
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.rig import expected_poses, shots_of
 from spherloc.mapping.upright import Level, arbitrary_scale
@@ -61,11 +61,13 @@ def place_rest(
     """The map with those left-out images whose pose is accepted; those named in ``elsewhere`` are not tried.
 
     ``gravity`` is that from vertical lines, by the name of the image. Where a camera took an image together with one
-    that is in the map, only matches that fit its expected pose are taken.
+    that is in the map, only matches that fit its expected pose are taken. An image that contradicts others once its
+    points are in the map is left out again.
     """
     names, shots = [view.name for view in views], shots_of(views)
+    refused = set(elsewhere)
     for round_number in count(1):
-        left = [view for view in views if view.name not in made.poses and view.name not in elsewhere]
+        left = [view for view in views if view.name not in made.poses and view.name not in refused]
         placed: dict[str, _Placed] = {}
         unit = arbitrary_scale(made.depths()).metres_per_unit
         expected = expected_poses(made.poses, shots)
@@ -77,6 +79,8 @@ def place_rest(
         if not placed:
             return made
         made = _with(made, placed)
+        doubted = placed.keys() & {name for pair in made.contradictions for name in pair}
+        made, refused = made.without(doubted), refused | doubted
         if round_number == MAX_ROUNDS:
             return made
     raise AssertionError  # count has no end
@@ -144,9 +148,8 @@ def _place(
 def _undoubted(made: Reconstruction, names: Sequence[str], name: str, placed: _Placed) -> bool:
     """Whether its neighbours in the map match it: at a place that only looks alike, hardly any do."""
     poses = {**made.poses, name: placed.cam_from_model}
-    seen = np.array([made.model.point3D(int(index)).xyz for index in placed.points])
-    points = {**points_of(made.model), name: seen}
-    return not any(name in pair for pair in contradictions(poses, names, made.all_matches, points))
+    points = {**points_of(made.model), name: SeenPoints.of(made.model, placed.points.tolist())}
+    return not any(name in pair for pair in contradictions(poses, names, made.all_matches, points, by_points=False))
 
 
 def with_images(made: Reconstruction, poses: Mapping[str, FloatArray]) -> Reconstruction:

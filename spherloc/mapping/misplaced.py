@@ -34,8 +34,8 @@ def without_misplaced(made: Reconstruction, rotations: Mapping[tuple[str, str], 
             count = int(made.matches[place[one], place[other]])
             for name, with_name in ((one, other), (other, one)):
                 if name in poses and with_name in poses:
-                    fits = _fits(poses[one], poses[other], rotation)
-                    balance[name] += count if fits else -count
+                    right = fits(poses[one], poses[other], rotation)
+                    balance[name] += count if right else -count
                 elif name in poses:
                     outside[name] = max(outside[name], count)
         worst = min(poses, key=lambda name: balance[name] - outside[name])
@@ -46,6 +46,6 @@ def without_misplaced(made: Reconstruction, rotations: Mapping[tuple[str, str], 
     return made.without(left_out) if left_out else made
 
 
-def _fits(one: FloatArray, other: FloatArray, rotation: FloatArray) -> bool:
+def fits(one: FloatArray, other: FloatArray, rotation: FloatArray, bound_rad: float = TURNED_RAD) -> bool:
     """Whether the rotations of poses (3, 4) of two images agree with that of their relative pose (3, 3)."""
-    return rotation_angle(other[:, :3] @ one[:, :3].T @ rotation.T) <= TURNED_RAD
+    return rotation_angle(other[:, :3] @ one[:, :3].T @ rotation.T) <= bound_rad

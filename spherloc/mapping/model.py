@@ -1,8 +1,8 @@
 """A model that COLMAP made, where it contradicts itself, and the parts into which it is then cut.
 
 Places that look alike (two hotel rooms, a row of houses) give wrong matches that fit a pose. A map that takes such
-places for one puts photographs next to each other that have hardly a match although nothing is between them: a
-contradiction. The map is then cut where fewest matches connect it.
+places for one puts photographs next to each other that have hardly a match, or hardly see each other's points, although
+nothing is between them: a contradiction. The map is then cut where fewest matches connect it.
 """
 
 import copy
@@ -16,7 +16,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.geometry import camera_centre
+from spherloc.geometry import camera_centre, transform
 from spherloc.types import FloatArray
 
 NEARBY, NEAR = 2, 3.0
@@ -27,8 +27,33 @@ MIN_SUPPORT = 0.15
 SIGHT_RAD, SIGHT_POINTS, SIGHT_FACTOR = np.radians(25.0), 8, 1.2
 """An image sees past another camera if it has at least the second number of points within the first angle around the
 direction of that camera, and half of them are farther away than the camera by the third factor."""
+SAME_VIEW_RAD, SAME_VIEW_DEPTH = np.radians(15.0), 1.5
+"""Two images should see a point alike if the rays to it differ by less, and its distances by a smaller factor."""
+SAME_VIEW_POINTS, SAME_VIEW_NEAR, MIN_SEEN = 100, 1.5, 0.1
+"""Two images contradict each other, too, if they should see so many points alike and less than that share of them are
+seen in both, where they are at most that many times as far from each other as from their nearest images. A piece of
+furniture that stands at two places gives many matches, but what is around it does not match."""
+EXPECTED_SEEN = 8, 20
+"""So many of so many points are added to those that two images see, and should see, alike: where a map is cut, few
+points say little."""
 COST_OF_CONTRADICTION = 4.0
 """Weight of the share of contradictions when two maps are compared by their share of images."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeenPoints:
+    """Points of a model that an image sees."""
+
+    ids: NDArray[np.int64]
+    """(K,) their ids in the model."""
+    points: FloatArray
+    """(K, 3) their positions."""
+
+    @staticmethod
+    def of(model: Any, ids: Collection[int]) -> "SeenPoints":
+        """The points ``ids`` of a model."""
+        found = np.array([model.point3D(int(one)).xyz for one in ids], np.float64).reshape(-1, 3)
+        return SeenPoints(np.array(list(ids), np.int64), found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,16 +109,22 @@ def parted(made: Reconstruction) -> list[Reconstruction]:
     """The model cut until no two images contradict each other: parts of two images or more, the largest first.
 
     A contradiction says that two images do not belong next to each other, so somewhere between them the model takes two
-    similar places for one. The cut that separates the two images with the fewest matches is made there.
+    similar places for one. The cut that separates the two images with the fewest matches is made there; matches count
+    less where the two images see little of what both should see.
     """
     if not made.contradictions:
         return [made]
     place = {name: index for index, name in enumerate(made.ids)}
+    points = points_of(made.model)
     graph = nx.Graph()
     graph.add_nodes_from(made.poses)
-    for one, other in combinations(made.poses, 2):
-        if matches := int(made.all_matches[place[one], place[other]]):
-            graph.add_edge(one, other, capacity=matches)
+    for pair in combinations(made.poses, 2):
+        if matches := int(made.all_matches[place[pair[0]], place[pair[1]]]):
+            alike, both = _seen_alike(made.poses, points, pair)
+            share = (both + EXPECTED_SEEN[0]) / (alike + EXPECTED_SEEN[1])
+            graph.add_edge(*pair, capacity=round(100 * matches * share))
+    if (alone := _contradicted_end(graph, made.contradictions)) is not None:
+        return parted(made.without({alone}).judged())
     cuts = [nx.minimum_cut(graph, *pair) for pair in sorted(set(map(_sorted, made.contradictions)))]
     _, (first, second) = min(cuts, key=lambda cut: cut[0])
     parts = []
@@ -102,6 +133,13 @@ def parted(made: Reconstruction) -> list[Reconstruction]:
             part = replace(made, model=copy.deepcopy(made.model)).without(side)
             parts += parted(part.judged())
     return sorted(parts, key=lambda part: -len(part.poses))
+
+
+def _contradicted_end(matched: nx.Graph, contradictions: Sequence[tuple[str, str]]) -> str | None:
+    """An image that only one other image matches, and which several others contradict, but nothing else."""
+    graph = nx.Graph(contradictions)
+    ends = [name for name in sorted(graph) if matched.degree[name] == 1 and graph.degree[name] > 1]
+    return next((name for name in ends if all(graph.degree[other] == 1 for other in graph[name])), None)
 
 
 def _sorted(pair: tuple[str, str]) -> tuple[str, str]:
@@ -143,48 +181,88 @@ def contradictions(
     poses: Mapping[str, FloatArray],
     names: Sequence[str],
     counts: NDArray[np.int64],
-    points: Mapping[str, FloatArray],
+    points: Mapping[str, SeenPoints],
+    by_points: bool = True,
 ) -> tuple[tuple[str, str], ...]:
-    """Pairs of neighbouring images of ``poses``, in sight of each other, that hardly match.
+    """Pairs of neighbouring images of ``poses``, in sight of each other, that hardly match or, if ``by_points``, hardly
+    see each other's points.
 
-    ``counts`` (V, V) are the numbers of matches of all ``names``, ``points`` (K, 3) the points that each image sees.
+    ``counts`` (V, V) are the numbers of matches of all ``names``, ``points`` what each image sees.
     """
     inside = [index for index, name in enumerate(names) if name in poses]
     centres = np.stack([camera_centre(poses[names[index]]) for index in inside])
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     np.fill_diagonal(apart, np.inf)
+    nearest = apart.min(axis=1)
     best = counts.max(axis=1)
     found = []
     for row, index in enumerate(inside):
-        for place in np.argsort(apart[row])[: min(NEARBY, len(inside) - 1)]:
-            other = inside[int(place)]
-            if apart[row, place] > NEAR * min(apart[row].min(), apart[place].min()):
+        for rank, place in enumerate(np.argsort(apart[row])[:-1].tolist()):
+            other = inside[place]
+            pair, distance = (names[index], names[other]), apart[row, place]
+            hardly_match = (
+                rank < NEARBY
+                and distance <= NEAR * min(nearest[row], nearest[place])
+                and counts[index, other] < MIN_SUPPORT * min(best[index], best[other])
+            )
+            limit = SAME_VIEW_NEAR * max(nearest[row], nearest[place])
+            side_by_side = by_points and row < place and distance <= limit
+            if not hardly_match and not side_by_side:
                 continue
-            if counts[index, other] >= MIN_SUPPORT * min(best[index], best[other]):
-                continue
-            here, there = centres[row], centres[int(place)]
-            if _sees_past(points[names[index]], here, there) and _sees_past(points[names[other]], there, here):
-                found.append((names[index], names[other]))
+            here, there = centres[row], centres[place]
+            past = _sees_past(points[pair[0]].points, here, there), _sees_past(points[pair[1]].points, there, here)
+            unseen = side_by_side and True in past and False not in past and _see_others(poses, points, pair)
+            if unseen or (hardly_match and all(past)):
+                found.append(pair)
     return tuple(found)
 
 
-def _sees_past(points: FloatArray, centre: FloatArray, other: FloatArray) -> bool:
-    """Whether the points (K, 3) that a camera at ``centre`` sees in the direction of another camera lie behind it.
+def _see_others(poses: Mapping[str, FloatArray], points: Mapping[str, SeenPoints], pair: tuple[str, str]) -> bool:
+    """Whether two images see hardly any of the points of each other that they should see alike."""
+    alike, both = _seen_alike(poses, points, pair)
+    return alike >= SAME_VIEW_POINTS and both < MIN_SEEN * alike
+
+
+def _seen_alike(
+    poses: Mapping[str, FloatArray], points: Mapping[str, SeenPoints], pair: tuple[str, str]
+) -> tuple[int, int]:
+    """How many of the points of either of two images both should see alike, and how many of these both see."""
+    alike = both = 0
+    for one, other in (pair, pair[::-1]):
+        there = points[other]
+        own = transform(poses[one], points[one].points)
+        seen = transform(poses[other], points[one].points)
+        ranges, other_ranges = np.linalg.norm(own, axis=1), np.linalg.norm(seen, axis=1)
+        rays = points[one].points - camera_centre(poses[one]), points[one].points - camera_centre(poses[other])
+        same = np.sum(rays[0] * rays[1], axis=1) >= np.cos(SAME_VIEW_RAD) * ranges * other_ranges
+        same &= np.maximum(ranges, other_ranges) <= SAME_VIEW_DEPTH * np.minimum(ranges, other_ranges)
+        field = transform(poses[other], there.points)
+        same &= seen[:, 2] >= np.min(field[:, 2] / np.linalg.norm(field, axis=1), initial=1.0) * other_ranges
+        alike += np.count_nonzero(same)
+        both += np.count_nonzero(same & np.isin(points[one].ids, there.ids))
+    return alike, both
+
+
+def _sees_past(points: FloatArray, centre: FloatArray, other: FloatArray) -> bool | None:
+    """Whether the points (K, 3) that a camera at ``centre`` sees in the direction of another camera lie behind it; None
+    if it sees too few there.
 
     With a wall between the two cameras they would lie in front of it; such cameras need not match.
     """
     rays, way = points - centre, other - centre
     depth, distance = np.linalg.norm(rays, axis=1), float(np.linalg.norm(way))
     near = rays @ way > np.cos(SIGHT_RAD) * depth * distance
-    return bool(np.count_nonzero(near) >= SIGHT_POINTS and np.median(depth[near]) > SIGHT_FACTOR * distance)
+    if np.count_nonzero(near) < SIGHT_POINTS:
+        return None
+    return bool(np.median(depth[near]) > SIGHT_FACTOR * distance)
 
 
-def points_of(model: Any) -> dict[str, FloatArray]:
-    """The points (K, 3) that each image of a model sees, by its name."""
+def points_of(model: Any) -> dict[str, SeenPoints]:
+    """The points that each image of a model sees, by its name."""
     found = {}
     for image in registered(model):
         ids = [point.point3D_id for point in image.points2D if point.has_point3D()]
-        found[image.name] = np.array([model.point3D(one).xyz for one in ids]).reshape(-1, 3)
+        found[image.name] = SeenPoints.of(model, ids)
     return found
 
 

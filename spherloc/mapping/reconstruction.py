@@ -5,8 +5,9 @@ not only a homography: a full sphere sees more than one plane, and matches that 
 poster or a floor that looks the same elsewhere.
 
 Where places look alike, a map may take two for one (see ``model``). A second map is made from the strong pairs alone,
-and the one with more images in all its parts, minus a penalty for contradictions, is taken. Where cameras took images
-together, maps of each by itself are a third candidate, joined by these images (see ``rig``).
+and the one with more images in all its parts, minus a penalty for contradictions, is taken. Where contradictions cut a
+map, both are made again without the pairs that had joined its parts. Where cameras took images together, maps of each
+by itself are another candidate, joined by these images (see ``rig``).
 """
 
 import ctypes
@@ -35,7 +36,7 @@ from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.later import with_images
-from spherloc.mapping.misplaced import without_misplaced
+from spherloc.mapping.misplaced import fits, without_misplaced
 from spherloc.mapping.model import Reconstruction, parted, registered, untangled, worth
 from spherloc.mapping.pairs import MIN_MATCHES, ImagePairs, relative
 from spherloc.mapping.parallel import Tell, as_completed
@@ -58,8 +59,15 @@ NEIGHBOURS_LEARNED, ALIKE_LEARNED = 2, 4
 """The same for LightGlue besides SIFT, which takes a second or two a pair."""
 WIDEST_RAD = np.radians(85.0)
 """Features farther from the optical axis are left out: COLMAP's fisheyes end at 90 degrees."""
+ROUNDS = 3
+"""Largest number of times that maps are made, each time without the pairs that joined what was cut."""
 STRONG = 0.3
 """A strong pair has this share of the matches of the best pair of either image."""
+CUT_RAD = float(np.radians(15.0))
+"""Largest angle between the rotation of a pair and that of its images in a map that was cut between them, if the pair
+says the same as that map: wrong pairs agree with each other less well than right ones."""
+Rotations = Mapping[tuple[str, str], FloatArray]
+"""Rotations (3, 3) of pairs of images by their names, the second from the first."""
 _TRIES = (
     {"init_min_num_inliers": 50, "init_min_tri_angle": 4.0},
     {"init_min_num_inliers": 25, "init_min_tri_angle": 2.0},
@@ -110,8 +118,9 @@ def reconstruct(
     except OSError as error:
         raise StoppedError(f"{whole}: cannot be written ({reason(error)}); {advice('go on')}.") from None
     with _database(pycolmap, whole) as database:
-        found = _with_images_between(database, ids, compared, found, at_one_place, tell)
-    agreed = _agreeing(found)
+        between = _with_images_between(database, ids, compared, _agreeing(found), at_one_place, tell)
+    every = {**found, **between}
+    agreed = _agreeing(between)
     counts, same_place = _counts(agreed, len(views)), _counts(at_one_place, len(views))
     if counts.max(initial=0) < MIN_MATCHES:
         if same_place.max(initial=0) >= MIN_MATCHES:
@@ -132,19 +141,29 @@ def reconstruct(
             "closer to each other, half a metre to two metres apart indoors."
         )
     names = [view.name for view in views]
-    rotations = {(names[one], names[other]): relative(geometry)[0] for (one, other), geometry in agreed.items()}
+    turns = {(names[one], names[other]): relative(geometry)[0] for (one, other), geometry in every.items()}
+    rotations = {(names[one], names[other]): turns[names[one], names[other]] for one, other in agreed}
     number_of = dict(zip(names, ids, strict=True))
     shots, made, rigid = shots_of(views), list[tuple[Reconstruction, ...]](), ()
     if shots:
         known = {name: one for name, one in zip(names, gravity, strict=True) if one is not None}
         tied = with_ties(counts + same_place, names, shots)
         own = counts * one_camera(names, shots)
-        models = _models_of(pycolmap, whole, number_of, rotations, own, same_place, 0.0, tell)
+        models, _ = _models_of(pycolmap, whole, number_of, (rotations, turns), own, same_place, 0.0, tell)
         if rigid := _joined(models, shots, known, counts, tied):
             made, same_place = [rigid], tied - counts
-    made += [
-        _models_of(pycolmap, whole, number_of, rotations, counts, same_place, keep, tell) for keep in (0.0, STRONG)
-    ]
+    for _ in range(ROUNDS):
+        cut = set[tuple[str, str]]()
+        for keep in (0.0, STRONG):
+            models, apart = _models_of(pycolmap, whole, number_of, (rotations, turns), counts, same_place, keep, tell)
+            made.append(models)
+            cut |= apart
+        if not cut:
+            break
+        every = {pair: geometry for pair, geometry in every.items() if (names[pair[0]], names[pair[1]]) not in cut}
+        agreed = _agreeing(every)
+        counts = _counts(agreed, len(views))
+        rotations = {(names[one], names[other]): turns[names[one], names[other]] for one, other in agreed}
     candidates = [models for models in made if models]
     if rigid:
         candidates = [models for models in candidates if not any(went_apart(one.poses, shots) for one in models)]
@@ -161,14 +180,17 @@ def _models_of(
     pycolmap: Any,
     path: Path,
     number_of: dict[str, int],
-    rotations: Mapping[tuple[str, str], FloatArray],
+    rotations: tuple[Rotations, Rotations],
     counts: NDArray[np.int64],
     same_place: NDArray[np.int64],
     keep: float,
     tell: Tell,
-) -> tuple[Reconstruction, ...]:
+) -> tuple[tuple[Reconstruction, ...], set[tuple[str, str]]]:
     """Models, the largest first, of the pairs with at least the share ``keep`` of the matches of either image's best
-    pair. ``number_of`` are the ids of all images by name, ``rotations`` those of all pairs."""
+    pair, and the pairs that joined what contradictions showed to be apart.
+
+    ``number_of`` are the ids of all images by name, ``rotations`` those of the pairs that agree and of all pairs.
+    """
     ids = list(number_of.values())
     with TemporaryDirectory() as folder:  # COLMAP uses all pairs of a database, and writes its models into a folder
         database = Path(folder) / "matches.db"
@@ -182,14 +204,30 @@ def _models_of(
                     opened.delete_two_view_geometry(*_of(ids, pair))
                     opened.delete_matches(*_of(ids, pair))
         models = _models(pycolmap, database, Path(folder), len(ids), tell)
-    found: list[Reconstruction] = []
+    found, cut = list[Reconstruction](), set[tuple[str, str]]()
     for model in models:
         poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in registered(model)}
         whole = Reconstruction(model, poses, counts, (), counts + same_place, path, number_of)
-        whole = without_misplaced(whole, rotations)
+        whole = without_misplaced(whole, rotations[0])
         if len(whole.poses) > 1:
-            found += parted(whole.judged())
-    return untangled(found)
+            whole = whole.judged()
+            parts = parted(whole)
+            cut |= _cut(whole, parts, rotations[1])
+            found += parts
+    return untangled(found), cut
+
+
+def _cut(whole: Reconstruction, parts: Sequence[Reconstruction], rotations: Rotations) -> set[tuple[str, str]]:
+    """Those pairs of images in different parts of a model whose rotations (3, 3) put them where that had them."""
+    part_of = {name: number for number, part in enumerate(parts) for name in part.poses}
+    return {
+        (one, other)
+        for (one, other), rotation in rotations.items()
+        if one in part_of
+        and other in part_of
+        and part_of[one] != part_of[other]
+        and fits(whole.poses[one], whole.poses[other], rotation, CUT_RAD)
+    }
 
 
 def _joined(
@@ -309,8 +347,8 @@ def _camera_in(pycolmap: Any, database: Any, camera: Camera) -> tuple[int, int]:
 def _matched(
     database: Any, ids: Sequence[int], compared: ImagePairs, waiting: Sequence[Pair], tell: Tell
 ) -> tuple[dict[Pair, Any], dict[Pair, Any], dict[Pair, int]]:
-    """The geometry of pairs whose rotations agree, that of pairs taken from one place, and the numbers of matches of
-    pairs that may show one thing at two places, which are in neither.
+    """The geometry of pairs, that of pairs taken from one place, and the numbers of matches of pairs that may show one
+    thing at two places, which are in neither.
 
     The matches are written into the database.
     """
@@ -333,7 +371,7 @@ def _matched(
         for pair, geometry in found.items()
         if compared.on_one_thing(*pair, database.read_matches(*_of(ids, pair)), geometry)
     }
-    return _agreeing({pair: found[pair] for pair in found if pair not in one_thing}), same_place, one_thing
+    return {pair: found[pair] for pair in found if pair not in one_thing}, same_place, one_thing
 
 
 def _with_images_between(

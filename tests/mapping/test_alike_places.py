@@ -7,7 +7,7 @@ import pycolmap
 
 from spherloc.geometry import pose
 from spherloc.mapping.make import nearer_to_others
-from spherloc.mapping.model import Reconstruction, contradictions, parted, untangled
+from spherloc.mapping.model import Reconstruction, SeenPoints, contradictions, parted, untangled
 
 ROOMS = {"day_0", "day_1", "day_2"}, {"night_0", "night_1", "night_2", "night_3"}
 NAMES = sorted(set.union(*ROOMS))
@@ -36,6 +36,11 @@ def walls(rng: np.random.Generator) -> np.ndarray:
     return 12.0 * rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
+def all_of(points: np.ndarray) -> SeenPoints:
+    """Points (K, 3) that are the first in the model."""
+    return SeenPoints(np.arange(len(points)), points)
+
+
 def model_of(points: np.ndarray) -> Reconstruction:
     """A model of COLMAP in which every image sees all points."""
     model = pycolmap.Reconstruction()
@@ -56,18 +61,18 @@ def model_of(points: np.ndarray) -> Reconstruction:
 
 def test_images_in_sight_of_each_other_that_hardly_match(rng):
     poses = {name: pose(np.eye(3), -centre) for name, centre in centres_of().items()}
-    seen = dict.fromkeys(NAMES, walls(rng))
+    seen = dict.fromkeys(NAMES, all_of(walls(rng)))
     against = contradictions(poses, NAMES, matches_of(alike=90), seen)
     assert against and all((one in ROOMS[0]) != (other in ROOMS[0]) for one, other in against)
     assert ("day_0", "night_0") not in against  # these do match
-    near = {name: centre + 0.3 * (walls(rng) / 12.0) for name, centre in centres_of().items()}
+    near = {name: all_of(centre + 0.3 * (walls(rng) / 12.0)) for name, centre in centres_of().items()}
     assert contradictions(poses, NAMES, matches_of(alike=90), near) == ()  # a wall round each
 
 
 def test_the_ends_of_a_walk_need_not_match(rng):
     """Of three in a row, the first and the last have no match; only where they are about as near do they contradict."""
     counts = np.array([[0, 90, 0], [90, 0, 80], [0, 80, 0]])
-    seen = dict.fromkeys("abc", walls(rng))
+    seen = dict.fromkeys("abc", all_of(walls(rng)))
 
     def at(*metres):
         poses = {name: pose(np.eye(3), -np.array([0.0, 0.0, x])) for name, x in zip("abc", metres, strict=True)}
@@ -85,3 +90,68 @@ def test_a_map_of_two_rooms_in_one_place_is_cut_between_them(rng):
         assert {image.name for image in map(part.model.image, part.model.reg_image_ids())} == set(part.poses)
     left = parts[0].without({"night_3"})
     assert nearer_to_others(left, parts[1:]) == ROOMS[0]  # none of them is tried in the larger map, night_3 is
+
+
+def two_of(rng, both: int, distance_m: float = 12.0) -> dict[str, SeenPoints]:
+    """What two images see, each 300 points around it: ``both`` of them are the same, the others are its own."""
+    points = walls(rng) * distance_m / 12.0
+    return {
+        "a": SeenPoints(np.arange(300), points[:300]),
+        "b": SeenPoints(np.arange(300 - both, 600 - both), points[300 - both : 600 - both]),
+    }
+
+
+def side_by_side(seen: dict[str, SeenPoints]) -> tuple[tuple[str, str], ...]:
+    """The contradictions of two images that are half a metre apart and match well."""
+    poses = {name: pose(np.eye(3), -np.array([0.5 * index, 0.0, 0.0])) for index, name in enumerate("ab")}
+    return contradictions(poses, ["a", "b"], np.array([[0, 300], [300, 0]]), seen)
+
+
+def test_images_that_match_but_see_other_things_around_them(rng):
+    """A bookcase that stands in two rooms: many matches, and nothing else is seen from both."""
+    assert side_by_side(two_of(rng, both=20)) == (("a", "b"),)
+    assert side_by_side(two_of(rng, both=120)) == ()
+    assert side_by_side(two_of(rng, both=20, distance_m=0.4)) == ()  # a wall round each: they need not see the same
+    poses = {name: pose(np.eye(3), -np.array([0.5 * index, 0.0, 0.0])) for index, name in enumerate("ab")}
+    counts = np.array([[0, 300], [300, 0]])
+    assert contradictions(poses, ["a", "b"], counts, two_of(rng, both=20), by_points=False) == ()
+
+
+def test_what_a_fisheye_cannot_see_does_not_count(rng):
+    """Two fisheyes that look to opposite sides see nothing in common."""
+    points = walls(rng)
+    ahead = points[:, 2] > 1.0
+    turned = np.diag([-1.0, 1.0, -1.0])
+    poses = {"a": pose(np.eye(3), np.zeros(3)), "b": pose(turned, turned @ np.array([-0.5, 0.0, 0.0]))}
+    seen = {
+        "a": SeenPoints(np.flatnonzero(ahead), points[ahead]),
+        "b": SeenPoints(np.flatnonzero(~ahead), points[~ahead] - [0.0, 0.0, 1.0]),
+    }
+    assert contradictions(poses, ["a", "b"], np.array([[0, 300], [300, 0]]), seen) == ()
+    poses["b"] = pose(np.eye(3), -np.array([0.5, 0.0, 0.0]))
+    seen["b"] = SeenPoints(np.arange(600, 600 + np.count_nonzero(ahead)), points[ahead] + [0.1, 0.0, 0.0])
+    assert contradictions(poses, ["a", "b"], np.array([[0, 300], [300, 0]]), seen) == (("a", "b"),)
+
+
+def test_an_image_that_one_pair_put_among_others_is_left_out_alone(rng):
+    """Of four in a row and one that only one of them matches, that one goes, though other pairs have fewer matches."""
+    names = ["a", "b", "c", "d", "x"]
+    points = walls(rng)
+    centres = dict(zip(names, np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [1.5, 0.0, 0.6]]), strict=True))
+    sees = dict.fromkeys(names[:4], range(300)) | {"x": range(100, 400)}
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=200, height=100, params=[200, 100], camera_id=1)
+    model.add_camera_with_trivial_rig(camera)
+    poses = {name: pose(np.eye(3), -centre) for name, centre in centres.items()}
+    for index, name in enumerate(names, start=1):
+        image = pycolmap.Image(name=name, keypoints=np.zeros((600, 2)), camera_id=1, image_id=index)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(poses[name]))
+    for row, point in enumerate(points):
+        seen_by = [index for index, name in enumerate(names, start=1) if row in sees[name]]
+        model.add_point3D(point, pycolmap.Track([pycolmap.TrackElement(index, row) for index in seen_by]))
+    counts = np.zeros((5, 5), np.int64)
+    for one, other, matches in ((0, 1, 60), (1, 2, 60), (2, 3, 60), (0, 2, 20), (1, 3, 20), (2, 4, 300)):
+        counts[one, other] = counts[other, one] = matches
+    ids = {name: index for index, name in enumerate(names, start=1)}
+    made = Reconstruction(model, poses, counts, (("b", "x"), ("c", "x")), counts, Path("unused"), ids)
+    assert [sorted(part.poses) for part in parted(made)] == [["a", "b", "c", "d"]]
