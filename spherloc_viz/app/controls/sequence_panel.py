@@ -12,8 +12,9 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import SpherlocError, shorten
 from spherloc.experiments.kept_results import kept_results
 from spherloc.experiments.results import LOCALIZED, QueryResult
-from spherloc.experiments.sequence import localize
+from spherloc.experiments.sequence import How, localize
 from spherloc.experiments.summary import success_rates
+from spherloc.mapping.joint_outcome import judged_together
 from spherloc.trace import Trace
 from spherloc_viz.app.controls.query_strip import QueryStrip
 from spherloc_viz.app.text import ramp_html, status_html, table_html
@@ -139,12 +140,26 @@ class SequencePanel:
                 self._done(trace)
                 if stop.is_set():
                     break
+            else:
+                self._judge_together(label, scene, How(estimator, options, seed), stop)
         except SpherlocError as error:
             self._text.content = status_html(str(error), wrong=True)
         finally:
             self._button.label, self._bar.visible = START, False
             with self._lock:
                 self._stop = None
+
+    def _judge_together(self, label: str, scene: MapScene, how: How, stop: threading.Event) -> None:
+        """Judge the queries of a scene by each other, now that all are localized by themselves."""
+        for row, trace in judged_together(scene, self.rows(label), how):
+            with self._lock:
+                rows = tuple(row if one.query == row.query else one for one in self._rows[label])
+                self._rows[label] = rows
+            self._text.content = sequence_html(rows, scene)
+            self._follow()
+            self._done(trace)
+            if stop.is_set():
+                break
 
 
 def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
