@@ -5,9 +5,10 @@ that stands otherwise than most of its partners say; and one without a believed 
 a partner gives, with the references there, and is localized if the outcome is, as for any query.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from spherloc.frontend.view import Matches, Report, View
 from spherloc.geometry import camera_centre, rotation_angle, transform
 from spherloc.mapping.later import EXPECTED_RAD, MIN_INLIERS
 from spherloc.mapping.neighbours import jumps
-from spherloc.mapping.rig import OFF, Rig, rig_of
+from spherloc.mapping.rig import MIN_TOGETHER, OFF, Rig, rig_of
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
 
@@ -42,13 +43,18 @@ Run = tuple[QueryResult, Trace | None]
 
 
 def judged_together(
-    scene: MapScene, rows: Sequence[QueryResult], how: How, report: Report = lambda done, count: None
+    scene: MapScene,
+    rows: Sequence[QueryResult],
+    how: How,
+    report: Report = lambda done, count: None,
+    say: Callable[[str], None] = lambda sentence: None,
 ) -> Iterator[Run]:
     """The rows that change where all ``rows`` of a scene's queries are judged by each other, and the new traces of
     those that were localized anew by ``how``.
 
     What others said before against a row is judged anew, as there may be more of them now; no query is tried twice.
-    ``report`` is called with the number of times done, of all at which several cameras took queries.
+    ``report`` is called with the number of times done, of all at which several cameras took queries, and ``say`` with a
+    sentence if the names of queries seem not to tell which were taken together.
     """
     before = {row.query: _words(row) for row in rows}
     judged = _Judged(scene, how, {row.query: _by_itself(row) for row in rows}, {})
@@ -58,6 +64,13 @@ def judged_together(
     if rig is not None:
         views = [view for view in scene.queries if view.name in before]
         times = [_Together(judged, rig, partners) for partners in _partners(rig, views)]
+    agree = [found for together in times for found in together.agreements()]
+    if agree.count(False) >= max(MIN_TOGETHER, len(agree) / 2):
+        say(
+            f"{agree.count(False)} of {len(agree)} pairs of queries that were taken at the same time, as their names "
+            "say, stand to each other otherwise than the cameras of the map do; they are not compared."
+        )
+        times = []
     yielded: set[str] = set()
     for done, together in enumerate(times, start=1):
         together.doubt()
@@ -167,6 +180,11 @@ class _Together:
         """Whether two queries stand to each other as their cameras do; None if that is not known."""
         expected, pose = self.expected(other, camera), self.row(camera).cam_from_map
         return None if expected is None or pose is None else self.rig.agrees(expected, pose)
+
+    def agreements(self) -> list[bool]:
+        """Whether the localized queries stand to each other as their cameras do, pair by pair."""
+        found = [self.agree(first, second) for first, second in combinations(self.sure, 2)]
+        return [agree for agree in found if agree is not None]
 
     def doubt(self) -> None:
         """Doubt those localized queries against which more of the others speak than for them.

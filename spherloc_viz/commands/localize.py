@@ -278,7 +278,7 @@ def _judge_together(scene: MapScene, log: ResultsLog, how: How, recorder: "_Reco
                 bars.append(stack.enter_context(progress(count, "times compared")))
             bars[0]("")
 
-        for row, trace in judged_together(scene, log.results().rows, how, report):
+        for row, trace in judged_together(scene, log.results().rows, how, report, say):
             if recorder is not None and trace is not None:
                 row = replace(row, recording=recorder.record(trace, row.query))
             log.change([row])
