@@ -21,7 +21,7 @@ from spherloc.frontend.view import Matches, Report, View
 from spherloc.geometry import camera_centre, rotation_angle, transform
 from spherloc.mapping.later import EXPECTED_RAD, MIN_INLIERS
 from spherloc.mapping.neighbours import jumps
-from spherloc.mapping.rig import MIN_TOGETHER, OFF, Rig, rig_of
+from spherloc.mapping.rig import MIN_TOGETHER, Rig, rig_of
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
 
@@ -29,14 +29,8 @@ FACING = float(np.cos(np.radians(75.0)))
 """References that look to another side than the expected pose, by more than this angle, are not matched."""
 TRIED = "Tried anew around the pose"
 """Beginning of the remark of a query that was tried around the pose that another one gives."""
-SEEN = 1.0 / OFF
-"""A query should match the map where a reference is no farther from the expected pose than a step of the way."""
-MIN_AGAINST, SHARE_AGAINST, OUTNUMBERED = 8, 0.4, 4
-"""A localized query is doubted if one taken together with it has elsewhere, though its pose is not believed, at least
-so many inliers and that share of those of the localized one, and so many times fewer matches about where that one has
-it."""
 _TOGETHER, _BETWEEN = "Taken together with", "Between"
-"""Beginnings of the sentences with which queries are doubted, and which need no other try to be said again."""
+"""Beginnings of the sentences with which queries are doubted."""
 
 Run = tuple[QueryResult, Trace | None]
 """A query's result, and its trace if there is one."""
@@ -149,8 +143,6 @@ class _Anew(NamedTuple):
     trace: Trace | None
     localized: bool
     """Whether it is localized about there."""
-    seen: bool
-    """Whether the map has an image about there, so that the query should match it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,8 +225,7 @@ class _Together:
         return False
 
     def try_anew(self) -> None:
-        """Try each query that has no believed pose around the pose that the best localized one gives; doubt that one if
-        it stands alone and the other's matches speak against it."""
+        """Try each query that has no believed pose around the pose that the best localized one gives."""
         for camera in sorted(self.partners):
             row = self.row(camera)
             known = [other for other in self.sure if self.expected(other, camera) is not None]
@@ -244,19 +235,8 @@ class _Together:
             anew = self._anew(other, camera)
             if anew.localized:
                 self._take(anew, other)
-                continue
-            self._note_in_vain(camera, other)
-            near, inliers = anew.row.matches or 0, row.inliers or 0
-            enough = inliers >= max(MIN_AGAINST, SHARE_AGAINST * (self.row(other).inliers or 0))
-            speaks = anew.seen and enough and near * OUTNUMBERED < inliers
-            alone = all(self.agree(one, other) is not True for one in self.sure)
-            if speaks and alone and self.agree(other, camera) is False:
-                self._put(
-                    self.row(other).doubted(
-                        f"Of the matches of {row.query}, which was taken together with it, {near} are about where "
-                        f"its pose has them, and {inliers} agree with another one."
-                    )
-                )
+            else:
+                self._note_in_vain(camera, other)
 
     def _best(self, cameras: Sequence[str]) -> str:
         """The camera whose query has most inliers."""
@@ -281,38 +261,39 @@ class _Together:
         """A camera's query, tried around the pose that the other camera's gives."""
         judged, name, expected = self.judged, self.partners[camera], self.expected(other, camera)
         assert expected is not None
-        view, around = judged.views[name], _references_around(expected, judged.scene.references)
+        view = judged.views[name]
         row, trace = solve_again(
             judged.scene,
             view,
             judged.rows[name].index,
-            lambda: _matches_near(judged.scene, view, expected, [reference for _, reference in around]),
+            lambda: _matches_near(judged.scene, view, expected),
             judged.how,
         )
         there = row.cam_from_map is not None and self.rig.agrees(expected, row.cam_from_map)
         localized = row.status == LOCALIZED and (row.inliers or 0) >= MIN_INLIERS and there
-        return _Anew(row, trace, localized, bool(around) and around[0][0] <= SEEN * self.rig.off)
+        return _Anew(row, trace, localized)
 
 
-def _references_around(expected: FloatArray, references: Sequence[View]) -> list[tuple[float, str]]:
-    """Distance, in units of the map, and names of references that look to about the same side as a pose (3, 4), the
-    nearest first."""
+def _references_around(expected: FloatArray, references: Sequence[View]) -> tuple[str, ...]:
+    """Names of references that look to about the same side as a pose (3, 4), the nearest first."""
     here = camera_centre(expected)
     posed = [(view.name, view.cam_from_map) for view in references if view.cam_from_map is not None]
-    return sorted(
+    apart = sorted(
         (float(np.linalg.norm(camera_centre(pose) - here)), name)
         for name, pose in posed
         if pose[2, :3] @ expected[2, :3] >= FACING
     )
+    return tuple(name for _, name in apart)
 
 
-def _matches_near(scene: MapScene, view: View, expected: FloatArray, names: Sequence[str]) -> Matches:
-    """The matches of a query, where they are found now with the first of the references of these ``names``, that are
-    near to where a pose (3, 4) has them."""
+def _matches_near(scene: MapScene, view: View, expected: FloatArray) -> Matches:
+    """The matches of a query that are near to where a pose (3, 4) has them; where matches are found now, those with the
+    references around that pose."""
     matcher = scene.matcher
     if isinstance(matcher, ImageMatcher):
         options = replace(matcher.options, references=SHORTLIST * matcher.options.references)
-        matcher = replace(matcher, options=options, pairs={view.name: tuple(names)})
+        pairs = {view.name: _references_around(expected, scene.references)}
+        matcher = replace(matcher, options=options, pairs=pairs)
     found = matcher(view)
     bearings, seen = view.camera.unproject(found.pixels)
     there = transform(expected, found.points)

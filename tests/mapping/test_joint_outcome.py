@@ -155,16 +155,6 @@ def test_of_three_the_majority_decides(tmp_path: Path) -> None:
     assert "not known" not in after["front/003.png"].message
 
 
-def test_a_query_that_the_matches_of_its_partner_contradict_is_doubted(tmp_path: Path) -> None:
-    """The partner's pose is not believed, but hardly any of its matches is where it should be."""
-    scene, rows = scene_of(tmp_path, ("left", "right"), {"left/002.png": (0, 60)})
-    rows = [replace(row, status=DOUBTFUL) if row.query in ("right/002.png", "right/004.png") else row for row in rows]
-    after = judged(scene, rows)
-    assert [row.query for row in after.values() if row.status != LOCALIZED] == ["left/002.png", "right/002.png"]
-    assert "Of the matches of right/002.png" in after["left/002.png"].message
-    assert after["left/002.png"].doubts and off_m(after["right/002.png"]) < 0.1
-
-
 def test_names_that_do_not_tell_the_time_are_not_believed(tmp_path: Path) -> None:
     scene, rows = scene_of(tmp_path, ("left", "right"), {}, shifted=2)
     said: list[str] = []

@@ -23,6 +23,8 @@ from spherloc_viz.layers.primitives import Table
 from spherloc_viz.style import error_scale
 
 START, STOP = "Localize all queries", "Stop"
+MAX_DOUBTS = 4
+"""Largest number of queries of which is told why other queries or maps speak against them."""
 
 
 class SequencePanel:
@@ -163,7 +165,8 @@ class SequencePanel:
 
 
 def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
-    """How far the sequence is, how many succeed within each limit, and what the colours of the dots mean."""
+    """How far the sequence is, how many succeed within each limit, what the colours of the dots mean, and why queries are
+    doubted that are localized by themselves."""
     rates, unit = success_rates(rows, scene.thresholds), "m" if scene.metric else "units"
     lines = [
         (f"within {rate.degrees:g}° and {rate.metres:g} {unit}", f"{rate.successes} of {rate.judged}") for rate in rates
@@ -174,4 +177,10 @@ def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
     errors = [row.translation_error_m for row in rows if row.translation_error_m is not None]
     scale, small = (100.0, "cm") if scene.metric else (1.0, unit)
     worst = f"{scale * error_scale(np.array(errors), limit_m):.2g} {small}; red beyond {limit_m:g} {unit}"
-    return table_html(Table("sequence", ("", ""), (done, located, *lines))) + (ramp_html("0", worst) if errors else "")
+    doubts = [f"{row.query} is doubtful: {why}" for row in rows for why in row.doubts]
+    more = [f"And {len(doubts) - MAX_DOUBTS} more are."] if len(doubts) > MAX_DOUBTS else []
+    return (
+        table_html(Table("sequence", ("", ""), (done, located, *lines)))
+        + (ramp_html("0", worst) if errors else "")
+        + "".join(status_html(sentence) for sentence in (*doubts[:MAX_DOUBTS], *more))
+    )
