@@ -165,8 +165,8 @@ class SequencePanel:
 
 
 def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
-    """How far the sequence is, how many succeed within each limit, what the colours of the dots mean, and why queries are
-    doubted that are localized by themselves."""
+    """How far the sequence is, how many succeed within each limit, what the colours of the dots mean, and why queries
+    are doubted that are localized by themselves."""
     rates, unit = success_rates(rows, scene.thresholds), "m" if scene.metric else "units"
     lines = [
         (f"within {rate.degrees:g}° and {rate.metres:g} {unit}", f"{rate.successes} of {rate.judged}") for rate in rates
