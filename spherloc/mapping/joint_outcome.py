@@ -21,7 +21,7 @@ from spherloc.frontend.view import Matches, Report, View
 from spherloc.geometry import camera_centre, rotation_angle, transform
 from spherloc.mapping.later import EXPECTED_RAD, MIN_INLIERS
 from spherloc.mapping.neighbours import jumps
-from spherloc.mapping.rig import MIN_TOGETHER, Rig, rig_of
+from spherloc.mapping.rig import MIN_TOGETHER, TURNED_RAD, Rig, rig_of
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
 
@@ -201,11 +201,10 @@ class _Together:
         expected, found = self.expected(other, camera), self.row(camera).cam_from_map
         assert expected is not None and found is not None  # else they were not compared
         off = float(np.linalg.norm(camera_centre(expected) - camera_centre(found)))
-        turned_deg = np.degrees(rotation_angle(found[:, :3] @ expected[:, :3].T))
-        return (
-            f"{_TOGETHER} {self.partners[other]}, it should be {off:.2g} {self.judged.unit} from where it is found, "
-            f"and turned by {turned_deg:.2g}°."
-        )
+        turned_rad = rotation_angle(found[:, :3] @ expected[:, :3].T)
+        turned = f", and turned by {np.degrees(turned_rad):.0f}°" if turned_rad > TURNED_RAD else ""
+        where = f"{off:.2g} {self.judged.unit} from where it is found{turned}"
+        return f"{_TOGETHER} {self.partners[other]}, it should be {where}."
 
     def _decide(self, first: str, second: str) -> bool:
         """Try both of two queries that disagree around the pose that the other one gives, and take what is decided;
