@@ -21,7 +21,7 @@ from spherloc.frontend.view import Matches, Report, View
 from spherloc.geometry import camera_centre, rotation_angle, transform
 from spherloc.mapping.later import EXPECTED_RAD, MIN_INLIERS
 from spherloc.mapping.neighbours import jumps
-from spherloc.mapping.rig import MIN_TOGETHER, TURNED_RAD, Rig, rig_of
+from spherloc.mapping.rig import MIN_TOGETHER, TURNED_RAD, FixedCameras, rig_of
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
 
@@ -83,7 +83,7 @@ def _words(row: QueryResult) -> tuple[object, ...]:
     return row.status, row.message, row.remarks
 
 
-def _partners(rig: Rig, queries: Sequence[View]) -> list[dict[str, str]]:
+def _partners(rig: FixedCameras, queries: Sequence[View]) -> list[dict[str, str]]:
     """The names of queries that were taken together, by camera, for each time of several."""
     found: dict[int, dict[str, str]] = {}
     for name, (camera, step) in rig.times_of(queries).items():
@@ -150,7 +150,7 @@ class _Together:
     """The queries that cameras fixed to each other took at one time."""
 
     judged: _Judged
-    rig: Rig
+    rig: FixedCameras
     partners: Mapping[str, str]
     """Names of the queries by camera."""
 

@@ -361,7 +361,7 @@ def disagree(
 
 
 @dataclass(frozen=True, eq=False)
-class Rig:
+class FixedCameras:
     """How cameras that are fixed to each other stand to each other in a map."""
 
     relative: Mapping[tuple[str, str], FloatArray]
@@ -396,7 +396,7 @@ class Rig:
         return bool(apart <= self.off and rotation_angle(found[:, :3] @ expected[:, :3].T) <= TURNED_RAD)
 
 
-def rig_of(views: Sequence[View]) -> Rig | None:
+def rig_of(views: Sequence[View]) -> FixedCameras | None:
     """How the cameras of images in a map stand to each other; None if there are no two that took ``MIN_TOGETHER``
     images together, and stand to each other alike at most times."""
     poses = {view.name: view.cam_from_map for view in views if view.cam_from_map is not None}
@@ -412,4 +412,4 @@ def rig_of(views: Sequence[View]) -> Rig | None:
     if not relative:
         return None
     keys = {camera: images for camera, images in _keys_of(known).items() if any(camera in pair for pair in relative)}
-    return Rig(relative, OFF * float(np.median(lengths)), _room(_steps_of(keys)))
+    return FixedCameras(relative, OFF * float(np.median(lengths)), _room(_steps_of(keys)))
