@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, permutations, product
+from itertools import combinations, product
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.imu import time_in_name
 from spherloc.frontend.view import View
-from spherloc.geometry import align_to_down, camera_centre, pose, rotation_angle, yaw_rotation
+from spherloc.geometry import align_to_down, camera_centre, inverse_pose, pose, rotation_angle, yaw_rotation
 from spherloc.types import BoolArray, FloatArray
 
 MIN_TOGETHER = 5
@@ -318,10 +318,13 @@ def misfits(poses: Mapping[str, FloatArray], shots: Shots) -> set[str]:
     return {name for name, count in balance.items() if count < 0}
 
 
-def _relative(one: FloatArray, other: FloatArray) -> FloatArray | None:
+def _relative(one: FloatArray, other: FloatArray, step: float | None = None) -> FloatArray | None:
     """The pose (3, 4) of the second camera from the first that most of their poses (K, 3, 4) agree on; None if too few
-    do."""
-    if len(one) < MIN_TOGETHER or (step := _step(_centres(one))) == 0.0:
+    do. A step of the way is that between these poses if it is not given."""
+    if len(one) < MIN_TOGETHER:
+        return None
+    step = _step(_centres(one)) if step is None else step
+    if step == 0.0:
         return None
     turns = other[:, :, :3] @ one[:, :, :3].transpose(0, 2, 1)
     shifts = other[:, :, 3] - np.einsum("kij,kj->ki", turns, one[:, :, 3])
@@ -402,13 +405,24 @@ def rig_of(views: Sequence[View]) -> FixedCameras | None:
     poses = {view.name: view.cam_from_map for view in views if view.cam_from_map is not None}
     known = [view for view in views if view.name in poses]
     shots = shots_of(known)
+    by_camera: dict[str, dict[int, FloatArray]] = {}
+    for name, (camera, step) in shots.items():
+        by_camera.setdefault(camera, {})[step] = poses[name]
     relative: dict[tuple[str, str], FloatArray] = {}
     lengths: list[float] = []
-    for pair in permutations(sorted({camera for camera, _ in shots.values()}), 2):
-        one, other = _together(poses, poses, shots, pair)
-        if (found := _relative(one, other)) is not None:
-            relative[pair] = found
-            lengths.append(_step(_centres(one)))
+    for first, second in combinations(sorted(by_camera), 2):
+        here, there = by_camera[first], by_camera[second]
+        both = sorted(here.keys() & there.keys())
+        if len(both) < MIN_TOGETHER:
+            continue
+        length = _step(_centres(np.array([here[step] for step in both])))
+        some = [
+            both[k] for k in np.unique(np.linspace(0, len(both) - 1, min(len(both), MAX_TRIED)).round().astype(int))
+        ]
+        one, other = (np.array([poses[step] for step in some]) for poses in (here, there))
+        if (found := _relative(one, other, length)) is not None:
+            relative[first, second], relative[second, first] = found, inverse_pose(found)
+            lengths.append(length)
     if not relative:
         return None
     keys = {camera: images for camera, images in _keys_of(known).items() if any(camera in pair for pair in relative)}

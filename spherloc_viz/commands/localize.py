@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -189,19 +190,20 @@ def localized(
         todo = [{view.name for view in _todo(scene, chosen, log, retry_failed)} for log in logs]
         wanted = [(view, [k for k, names in enumerate(todo) if view.name in names]) for view in chosen]
         wanted = [(view, indices) for view, indices in wanted if indices]
-        recorders: list[_Recorder | None] = []
-        if wanted or together:
+
+        @cache
+        def recorders() -> tuple[_Recorder | None, ...]:
             stores = [stack.enter_context(store_of(item.records)) for item in solvings]
-            recorders = [
+            return tuple(
                 None if store is None else _Recorder(store, path.resolve(), log)
                 for store, log in zip(stores, logs, strict=True)
-            ]
+            )
+
         if wanted:
             warm_up(say, {name for item in solvings for name in (item.estimator, item.initialise) if name is not None})
-            _work(scene, wanted, logs, hows, recorders)
-        if together:
-            for log, how, recorder in zip(logs, hows, recorders, strict=True):
-                _judge_together(scene, log, how, recorder)
+            _work(scene, wanted, logs, hows, recorders())
+        for index in range(len(logs)) if together else ():
+            _judge_together(scene, logs[index], hows[index], lambda index=index: recorders()[index])
         results = [log.results() for log in logs]
         backdrop = backdrop_of(scene)
         for log, found in zip(logs, results, strict=True):
@@ -268,8 +270,9 @@ def _work(
                 advance(f"{failed} without a pose")
 
 
-def _judge_together(scene: MapScene, log: ResultsLog, how: How, recorder: "_Recorder | None") -> None:
-    """Judge the queries of a log by each other; what is changed is written at once."""
+def _judge_together(scene: MapScene, log: ResultsLog, how: How, recorder_of: "Callable[[], _Recorder | None]") -> None:
+    """Judge the queries of a log by each other; what is changed is written at once, and what was tried anew is recorded
+    where ``recorder_of`` gives a recorder."""
     with _told_if_stopped([log]), ExitStack() as stack:
         bars: list[Callable[[str], None]] = []
 
@@ -279,7 +282,7 @@ def _judge_together(scene: MapScene, log: ResultsLog, how: How, recorder: "_Reco
             bars[0]("")
 
         for row, trace in judged_together(scene, log.results().rows, how, report, say):
-            if recorder is not None and trace is not None:
+            if trace is not None and (recorder := recorder_of()) is not None:
                 row = replace(row, recording=recorder.record(trace, row.query))
             log.change([row])
 
