@@ -26,6 +26,7 @@ from spherloc.mapping.joint_outcome import judged_together
 ROWS = (
     *("campus:7", "campus:11", "campus:3", "campus:21", "apartment:5", "apartment:12", "apartment:3"),
     *("street:5", "street:9", "campus:3:half", "apartment:5:half", "apartment:8:half", "street:9:half"),
+    *("campus:31", "apartment:21:half"),
 )
 WHOLE, HALF, SPARSE = "", "half", "sparse"
 WRONG_M, WRONG_DEG = 1.0, 5.0
