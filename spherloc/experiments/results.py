@@ -40,8 +40,9 @@ class QueryResult:
     query: str
     """Name of the query image."""
     status: str
-    """"localized"; "doubtful": there is a pose, but it is not believed, see ``spherloc.outcome``; "failed": the image
-    is usable but has no pose; "unreadable": the image cannot be used and does not count in success rates."""
+    """"localized"; "doubtful": there is a pose, but it is not believed, see ``spherloc.outcome``, or other queries or
+    maps speak against it; "failed": the image is usable but has no pose; "unreadable": the image cannot be used and
+    does not count in success rates."""
     timestamp_s: float | None = None
     """When the image was taken, seconds."""
     references: int | None = None
