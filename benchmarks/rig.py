@@ -60,11 +60,11 @@ def cut(panorama: ByteArray, yaw_deg: float) -> ByteArray:
     return cv2.remap(panorama, at, None, cv2.INTER_LINEAR)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
-def photographed(world: str, seed: int, folder: Path) -> dict[str, FloatArray]:
-    """Write the fisheyes into two folders in a folder; returns their true positions (3,), metres, by name."""
+def photographed(world: str, seed: int, folder: Path, times: int = TIMES) -> dict[str, FloatArray]:
+    """Write the fisheyes of so many times into two folders in a folder; returns their true poses (3, 4) by name."""
     path = folder.with_suffix(".toml")
-    path.write_text(SCENE.format(world=world, seed=seed, count=TIMES))
-    places = {}
+    path.write_text(SCENE.format(world=world, seed=seed, count=times))
+    poses = {}
     for camera in LOOKS_DEG:
         (folder / camera).mkdir(parents=True)
         said = "\n".join(f"{key} = {json.dumps(value)}" for key, value in FISHEYE.to_dict().items())
@@ -74,8 +74,8 @@ def photographed(world: str, seed: int, folder: Path) -> dict[str, FloatArray]:
         for camera, yaw_deg in LOOKS_DEG.items():
             name = f"{camera}/{time:03d}.png"
             cv2.imwrite(str(folder / name), cut(panorama, yaw_deg))
-            places[name] = camera_centre(view.cam_from_map)
-    return places
+            poses[name] = yaw_rotation(np.radians(yaw_deg)).T @ view.cam_from_map
+    return poses
 
 
 def renamed(folder: Path, places: dict[str, FloatArray]) -> dict[str, FloatArray]:
@@ -111,7 +111,8 @@ def main() -> None:
         world, _, seed = one.partition(":")
         with TemporaryDirectory() as place:
             folder = Path(place) / "images"
-            places = photographed(world, int(seed), folder)
+            poses = photographed(world, int(seed), folder)
+            places = {name: camera_centre(pose) for name, pose in poses.items()}
             together = cells(folder, Path(place) / "together", places)
             alone = cells(folder, Path(place) / "alone", renamed(folder, places))
         print(f"| {one} | {alone} {together}", flush=True)

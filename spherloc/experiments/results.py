@@ -9,7 +9,7 @@ import math
 import os
 import re
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -40,8 +40,9 @@ class QueryResult:
     query: str
     """Name of the query image."""
     status: str
-    """"localized"; "doubtful": there is a pose, but it is not believed, see ``spherloc.outcome``; "failed": the image
-    is usable but has no pose; "unreadable": the image cannot be used and does not count in success rates."""
+    """"localized"; "doubtful": there is a pose, but it is not believed, see ``spherloc.outcome``, or other queries or
+    maps speak against it; "failed": the image is usable but has no pose; "unreadable": the image cannot be used and
+    does not count in success rates."""
     timestamp_s: float | None = None
     """When the image was taken, seconds."""
     references: int | None = None
@@ -94,6 +95,17 @@ class QueryResult:
     """Estimated pose (3, 4)."""
     truth_cam_from_map: FloatArray | None = None
     """True pose (3, 4)."""
+
+    def doubted(self, why: str) -> "QueryResult":
+        """The row of a localized query as a doubtful one, since other maps or other queries speak against its pose, as
+        the sentence ``why`` says."""
+        return replace(self, status=DOUBTFUL, message=f"{self.message} {why}", remarks=(*self.remarks, why))
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """The sentence with which it was ``doubted``; none otherwise."""
+        ends = self.status == DOUBTFUL and self.remarks and self.message.endswith(self.remarks[-1])
+        return self.remarks[-1:] if ends else ()
 
     @property
     def position_m(self) -> FloatArray:

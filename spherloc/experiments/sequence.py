@@ -92,12 +92,26 @@ def localize_by_each(
     places = {view.name: place for place, view in enumerate(scene.queries)}
     tracking = [False] * len(hows)
     for (view, chosen), (matches, matching_ms) in _one_ahead(lambda item: _match(scene, item[0]), queries):
-        row = QueryResult(places[view.name], view.name, FAILED, view.timestamp_s, matching_ms=matching_ms)
-        row = replace(row, truth_cam_from_map=_array(view.cam_from_map), inputs=inputs_of(view))
+        row = _unsolved(places[view.name], view, matching_ms)
         for index in chosen:
             found, trace = _solve(scene, view, matches, row, hows[index], tracking[index])
             tracking[index] = found.status == LOCALIZED
             yield index, found, trace
+
+
+def solve_again(
+    scene: MapScene, view: View, index: int, matched: Callable[[], Matches], how: How
+) -> tuple[QueryResult, Trace | None]:
+    """The result of one query, the scene's number ``index``, with the matches that ``matched`` finds for it, and its
+    trace if there was a problem to solve. An error is reported in the result."""
+    matches, matching_ms = _timed(matched)
+    return _solve(scene, view, matches, _unsolved(index, view, matching_ms), how, tracking=True)
+
+
+def _unsolved(index: int, view: View, matching_ms: float) -> QueryResult:
+    """The row of a query that is matched."""
+    row = QueryResult(index, view.name, FAILED, view.timestamp_s, matching_ms=matching_ms)
+    return replace(row, truth_cam_from_map=_array(view.cam_from_map), inputs=inputs_of(view))
 
 
 def has_changed(view: View, row: QueryResult) -> bool:
@@ -118,9 +132,14 @@ def inputs_of(view: View) -> str:
 
 
 def _match(scene: MapScene, view: View) -> tuple[Matches | SpherlocError, float]:
+    return _timed(lambda: scene.matcher(view))
+
+
+def _timed(matched: Callable[[], Matches]) -> tuple[Matches | SpherlocError, float]:
+    """The matches, or why there are none, and the time that took, ms."""
     start = time.perf_counter()
     try:
-        found: Matches | SpherlocError = scene.matcher(view)
+        found: Matches | SpherlocError = matched()
     except SpherlocError as error:
         found = error
     return found, (time.perf_counter() - start) * 1e3

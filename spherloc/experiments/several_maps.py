@@ -6,9 +6,8 @@ the places that look alike, explains more of its matches.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
-from spherloc.experiments.results import DOUBTFUL, LOCALIZED, POSED, QueryResult, SequenceResults
+from spherloc.experiments.results import LOCALIZED, POSED, QueryResult, SequenceResults
 
 
 def outdone(results: Sequence[SequenceResults]) -> list[list[QueryResult]]:
@@ -34,5 +33,4 @@ def outdone(results: Sequence[SequenceResults]) -> list[list[QueryResult]]:
 
 def _doubted(row: QueryResult, better: SequenceResults) -> QueryResult:
     where = better.configuration.scene
-    why = f"More of its matches agree with a pose in the map of {where}; it may have been taken there."
-    return replace(row, status=DOUBTFUL, message=f"{row.message} {why}", remarks=(*row.remarks, why))
+    return row.doubted(f"More of its matches agree with a pose in the map of {where}; it may have been taken there.")

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.imu import time_in_name
 from spherloc.frontend.view import View
-from spherloc.geometry import align_to_down, camera_centre, pose, rotation_angle, yaw_rotation
+from spherloc.geometry import align_to_down, camera_centre, inverse_pose, pose, rotation_angle, yaw_rotation
 from spherloc.types import BoolArray, FloatArray
 
 MIN_TOGETHER = 5
@@ -52,28 +52,51 @@ _NUMBERS = re.compile(r"\d+(?:\.\d+)?")
 def shots_of(views: Sequence[View]) -> Shots:
     """Camera and time step of the images of cameras that took most of their images together, as names and times in them
     say; none if there are no two such cameras. A panorama sees all around and is left out."""
-    keys: dict[str, dict[str, float]] = {}
-    for view in views:
-        if not isinstance(view.camera, Equirectangular) and (named := _camera_and_key(view.name)):
-            keys.setdefault(named[0], {})[view.name] = named[1]
-    keys = {camera: images for camera, images in keys.items() if len(images) >= MIN_TOGETHER}
+    keys = {camera: images for camera, images in _keys_of(views).items() if len(images) >= MIN_TOGETHER}
     if len(keys) < 2:
         return {}
-    reference = max(keys, key=lambda camera: len(keys[camera]))
-    steps = np.unique(list(keys[reference].values()))
+    steps = _steps_of(keys)
     if len(steps) < MIN_TOGETHER:
         return {}
-    room = NEAR_IN_TIME * float(np.median(np.diff(steps)))
     found: dict[str, tuple[str, int]] = {}
-    for camera, images in keys.items():
-        nearest = {name: int(np.argmin(np.abs(steps - key))) for name, key in images.items()}
-        together = {name: step for name, step in nearest.items() if abs(steps[step] - images[name]) <= room}
-        if len(set(together.values())) >= max(MIN_TOGETHER, SHARE_TOGETHER * min(len(images), len(steps))):
-            found.update({name: (camera, step) for name, step in together.items()})
+    for camera, together in _in_steps(keys, steps, _room(steps)).items():
+        count = len({step for _, step in together.values()})
+        if count >= max(MIN_TOGETHER, SHARE_TOGETHER * min(len(keys[camera]), len(steps))):
+            found.update(together)
     return found if len({camera for camera, _ in found.values()}) > 1 else {}
 
 
-def _camera_and_key(name: str) -> tuple[str, float] | None:
+def _keys_of(views: Sequence[View]) -> dict[str, dict[str, float]]:
+    """The number or time of each image by its name, by its camera; panoramas are left out."""
+    keys: dict[str, dict[str, float]] = {}
+    for view in views:
+        if not isinstance(view.camera, Equirectangular) and (named := camera_and_key(view.name)):
+            keys.setdefault(named[0], {})[view.name] = named[1]
+    return keys
+
+
+def _steps_of(keys: Mapping[str, Mapping[str, float]]) -> FloatArray:
+    """Numbers or times (T,) of the camera with most images, growing."""
+    return np.unique(list(max(keys.values(), key=len).values()))
+
+
+def _room(steps: FloatArray) -> float:
+    """How far numbers or times of images that were taken together may differ where steps are these (T,)."""
+    return NEAR_IN_TIME * float(np.median(np.diff(steps)))
+
+
+def _in_steps(keys: Mapping[str, Mapping[str, float]], steps: FloatArray, room: float) -> dict[str, Shots]:
+    """Camera and time step of each image that is near enough to one, by the camera."""
+    found: dict[str, Shots] = {}
+    for camera, images in keys.items():
+        nearest = {name: int(np.argmin(np.abs(steps - key))) for name, key in images.items()}
+        found[camera] = {
+            name: (camera, step) for name, step in nearest.items() if abs(steps[step] - images[name]) <= room
+        }
+    return found
+
+
+def camera_and_key(name: str) -> tuple[str, float] | None:
     """The camera that a name tells, its folder or what is left of it without its longest number, and that number or
     the time that it is; None without a number."""
     path = PurePosixPath(name)
@@ -295,10 +318,13 @@ def misfits(poses: Mapping[str, FloatArray], shots: Shots) -> set[str]:
     return {name for name, count in balance.items() if count < 0}
 
 
-def _relative(one: FloatArray, other: FloatArray) -> FloatArray | None:
+def _relative(one: FloatArray, other: FloatArray, step: float | None = None) -> FloatArray | None:
     """The pose (3, 4) of the second camera from the first that most of their poses (K, 3, 4) agree on; None if too few
-    do."""
-    if len(one) < MIN_TOGETHER or (step := _step(_centres(one))) == 0.0:
+    do. A step of the way is that between these poses if it is not given."""
+    if len(one) < MIN_TOGETHER:
+        return None
+    step = _step(_centres(one)) if step is None else step
+    if step == 0.0:
         return None
     turns = other[:, :, :3] @ one[:, :, :3].transpose(0, 2, 1)
     shifts = other[:, :, 3] - np.einsum("kij,kj->ki", turns, one[:, :, 3])
@@ -335,3 +361,69 @@ def disagree(
             if len(_together(poses, others, shots, (first, second))[0]) >= MIN_TOGETHER:
                 return pair
     return None
+
+
+@dataclass(frozen=True, eq=False)
+class FixedCameras:
+    """How cameras that are fixed to each other stand to each other in a map."""
+
+    relative: Mapping[tuple[str, str], FloatArray]
+    """Pose (3, 4) of the second camera from the first, in units of the map, by the names of both."""
+    off: float
+    """How far apart, in units of the map, the position of an image and that which another one taken together with it
+    expects may be."""
+    room: float
+    """How far numbers or times in the names of images taken together may differ."""
+
+    def times_of(self, views: Sequence[View]) -> Shots:
+        """Camera and time step of other images of these cameras."""
+        cameras = {camera for pair in self.relative for camera in pair}
+        keys = {camera: images for camera, images in _keys_of(views).items() if camera in cameras}
+        if len(keys) < 2:
+            return {}
+        own = [np.unique(list(images.values())) for images in keys.values()]
+        room = min([self.room, *(_room(steps) for steps in own if len(steps) > 1)])
+        steps = np.unique(np.concatenate(own))
+        steps = steps[np.diff(steps, prepend=-np.inf) > room]
+        return {name: shot for shots in _in_steps(keys, steps, room).values() for name, shot in shots.items()}
+
+    def expected(self, first: tuple[str, FloatArray], second: str) -> FloatArray | None:
+        """The pose (3, 4) of the second camera where that of the first one is known, by its name and its pose (3, 4);
+        None if it is not known how they stand to each other."""
+        relative = self.relative.get((first[0], second))
+        return None if relative is None else _after(relative, first[1])
+
+    def agrees(self, expected: FloatArray, found: FloatArray) -> bool:
+        """Whether a pose (3, 4) is about the expected one (3, 4)."""
+        apart = np.linalg.norm(camera_centre(expected) - camera_centre(found))
+        return bool(apart <= self.off and rotation_angle(found[:, :3] @ expected[:, :3].T) <= TURNED_RAD)
+
+
+def rig_of(views: Sequence[View]) -> FixedCameras | None:
+    """How the cameras of images in a map stand to each other; None if there are no two that took ``MIN_TOGETHER``
+    images together, and stand to each other alike at most times."""
+    poses = {view.name: view.cam_from_map for view in views if view.cam_from_map is not None}
+    known = [view for view in views if view.name in poses]
+    shots = shots_of(known)
+    by_camera: dict[str, dict[int, FloatArray]] = {}
+    for name, (camera, step) in shots.items():
+        by_camera.setdefault(camera, {})[step] = poses[name]
+    relative: dict[tuple[str, str], FloatArray] = {}
+    lengths: list[float] = []
+    for first, second in combinations(sorted(by_camera), 2):
+        here, there = by_camera[first], by_camera[second]
+        both = sorted(here.keys() & there.keys())
+        if len(both) < MIN_TOGETHER:
+            continue
+        length = _step(_centres(np.array([here[step] for step in both])))
+        some = [
+            both[k] for k in np.unique(np.linspace(0, len(both) - 1, min(len(both), MAX_TRIED)).round().astype(int))
+        ]
+        one, other = (np.array([poses[step] for step in some]) for poses in (here, there))
+        if (found := _relative(one, other, length)) is not None:
+            relative[first, second], relative[second, first] = found, inverse_pose(found)
+            lengths.append(length)
+    if not relative:
+        return None
+    keys = {camera: images for camera, images in _keys_of(known).items() if any(camera in pair for pair in relative)}
+    return FixedCameras(relative, OFF * float(np.median(lengths)), _room(_steps_of(keys)))

@@ -1,8 +1,9 @@
 """``spherloc localize``: sequences of queries against a map, resumable, and tables and pictures that compare them."""
 
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +33,7 @@ from spherloc.experiments.summary import (
     vehicle_trajectory,
 )
 from spherloc.frontend.view import View
+from spherloc.mapping.joint_outcome import judged_together
 from spherloc.trace import Trace
 from spherloc.trajectory import write_tum
 from spherloc.warm_up import warm_up
@@ -90,7 +92,7 @@ def localize_sequence(
     0 if every chosen query is localized by each, 1 if one is doubtful or has no pose. Raises ``InputError`` for
     whatever makes all of it impossible.
     """
-    done = localized(path, solvings, seed, queries, retry_failed)
+    done = localized(path, solvings, seed, queries, retry_failed, together=True)
     for found in done.results:
         print(sequence_text(found, summarize(found), done.scene), flush=True)
     return _code(done)
@@ -102,7 +104,7 @@ def localize_in_maps(solvings: Mapping[Path, Solving]) -> int:
 
     0 if every photograph is localized in one of the maps. Raises ``InputError`` as ``localize_sequence`` does.
     """
-    done = {path: localized(path, [solving], 0, (), False) for path, solving in solvings.items()}
+    done = {path: localized(path, [solving], 0, (), False, together=True) for path, solving in solvings.items()}
     changed = outdone([one.results[0] for one in done.values()])
     for one, rows in zip(done.values(), changed, strict=True):
         found = one.results[0]
@@ -150,11 +152,18 @@ class Localized:
 
 
 def localized(
-    path: Path, solvings: Sequence[Solving], seed: int, queries: Sequence[str], retry_failed: bool
+    path: Path,
+    solvings: Sequence[Solving],
+    seed: int,
+    queries: Sequence[str],
+    retry_failed: bool,
+    *,
+    together: bool = False,
 ) -> Localized:
     """The results of a sequence by each of the estimators; each query is matched once for all.
 
-    Raises ``InputError`` as ``localize_sequence`` does.
+    With ``together``, queries are judged by each other in the end; a comparison of estimators tells what each finds by
+    itself. Raises ``InputError`` as ``localize_sequence`` does.
     """
     from spherloc_viz.plots.trajectories import backdrop_of
 
@@ -181,14 +190,20 @@ def localized(
         todo = [{view.name for view in _todo(scene, chosen, log, retry_failed)} for log in logs]
         wanted = [(view, [k for k, names in enumerate(todo) if view.name in names]) for view in chosen]
         wanted = [(view, indices) for view, indices in wanted if indices]
-        if wanted:
-            warm_up(say, {name for item in solvings for name in (item.estimator, item.initialise) if name is not None})
+
+        @cache
+        def recorders() -> tuple[_Recorder | None, ...]:
             stores = [stack.enter_context(store_of(item.records)) for item in solvings]
-            recorders = [
+            return tuple(
                 None if store is None else _Recorder(store, path.resolve(), log)
                 for store, log in zip(stores, logs, strict=True)
-            ]
-            _work(scene, wanted, logs, hows, recorders)
+            )
+
+        if wanted:
+            warm_up(say, {name for item in solvings for name in (item.estimator, item.initialise) if name is not None})
+            _work(scene, wanted, logs, hows, recorders())
+        for index in range(len(logs)) if together else ():
+            _judge_together(scene, logs[index], hows[index], lambda index=index: recorders()[index])
         results = [log.results() for log in logs]
         backdrop = backdrop_of(scene)
         for log, found in zip(logs, results, strict=True):
@@ -242,7 +257,7 @@ def _work(
     recorders: "Sequence[_Recorder | None]",
 ) -> None:
     failed = 0
-    try:
+    with _told_if_stopped(logs):
         prepare(scene)
         with progress(sum(len(indices) for _, indices in wanted), "queries") as advance:
             for index, row, trace in localize_by_each(scene, wanted, hows):
@@ -253,6 +268,30 @@ def _work(
                 logs[index].append(row)
                 failed += row.status not in POSED
                 advance(f"{failed} without a pose")
+
+
+def _judge_together(scene: MapScene, log: ResultsLog, how: How, recorder_of: "Callable[[], _Recorder | None]") -> None:
+    """Judge the queries of a log by each other; what is changed is written at once, and what was tried anew is recorded
+    where ``recorder_of`` gives a recorder."""
+    with _told_if_stopped([log]), ExitStack() as stack:
+        bars: list[Callable[[str], None]] = []
+
+        def report(done: int, count: int) -> None:
+            if not bars:
+                bars.append(stack.enter_context(progress(count, "times compared")))
+            bars[0]("")
+
+        for row, trace in judged_together(scene, log.results().rows, how, report, say):
+            if trace is not None and (recorder := recorder_of()) is not None:
+                row = replace(row, recording=recorder.record(trace, row.query))
+            log.change([row])
+
+
+@contextmanager
+def _told_if_stopped(logs: Sequence[ResultsLog]) -> Iterator[None]:
+    """Say what is kept if Ctrl-C stops what is done inside."""
+    try:
+        yield
     except KeyboardInterrupt:
         for log in logs:
             so_far = f"{len(log.rows)} of {log.configuration.queries} queries are done"

@@ -12,6 +12,7 @@ from spherloc.experiments.sequence import INITIALISED
 from spherloc.experiments.summary import SuccessRate, Summary, TrajectoryError, timed
 from spherloc.frontend.gravity_from_lines import why_not_found
 from spherloc.frontend.pipeline import NO_POINT
+from spherloc.mapping.joint_outcome import TRIED, tried_anew
 from spherloc_viz.layers.where_taken import nearest
 
 MAX_TOLD, MAX_EACH = 5, 20
@@ -34,6 +35,8 @@ def sequence_text(results: SequenceResults, summary: Summary, scene: MapScene) -
     first = sum(any(remark.startswith(INITIALISED) for remark in row.remarks) for row in results.rows)
     if first:
         lines.append(f"  {first} initialised by {setting.options['initialise']}, the others tracked")
+    if anew := sum(row.status == LOCALIZED and tried_anew(row) for row in results.rows):
+        lines.append(f"  {anew} of them around the poses that queries taken together with them give")
     lines += [f"  {line}" for line in _wrong(results)]
     rates = (*summary.success, *summary.registration_success)
     lines += [f"  success {_rate(rate, setting.unit)}" for rate in rates if rate.judged or not summary.without_truth]
@@ -156,7 +159,7 @@ def _remarks(rows: Sequence[QueryResult]) -> Iterator[str]:
     """Lines on what was wrong with the files or the gravity of queries, each of which may be of several queries."""
     about: dict[str, list[str]] = {}
     for row in rows:
-        known = (NO_POINT, INITIALISED) if row.status in POSED else (INITIALISED,)
+        known = (NO_POINT, INITIALISED, TRIED) if row.status in POSED else (INITIALISED, TRIED)
         for remark in row.remarks:
             if not why_not_found(remark) and not any(word in remark for word in known):
                 about.setdefault(remark, []).append(row.query)

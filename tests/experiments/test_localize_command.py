@@ -27,11 +27,13 @@ from spherloc.datasets.map_scene import OPTIONAL, OPTIONAL_EXAMPLE, MapScene
 from spherloc.errors import SpherlocError
 from spherloc.experiments import read_results
 from spherloc.experiments.kept_results import kept_results
-from spherloc.experiments.sequence import inputs_of
+from spherloc.experiments.sequence import inputs_of, localize
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.scene_files import MODEL, SCENE
 from spherloc.trajectory import read_tum
 from spherloc.warm_up import warm_up
+from spherloc_viz.app.controls.query_strip import said_of
+from spherloc_viz.app.controls.sequence_panel import sequence_html
 from spherloc_viz.commands.bundled import all_scenes, one_kind
 from spherloc_viz.commands.image_commands import _results_name
 from spherloc_viz.commands.localize import Solving, compare_sequences, localize_in_maps, localize_sequence
@@ -386,6 +388,39 @@ def test_the_picture_shows_truth_errors_and_failures(tmp_path: Path, capsys: pyt
     assert believed == 0 and doubted > 20, "a pose that is not believed looks like one that is"
     (tmp_path / "none").mkdir()
     assert run(write_scene(tmp_path / "none", queries=2, few=[0, 1]), tmp_path / "none" / "out") == 1
+
+
+@pytest.mark.usefixtures("drawn")
+def test_what_other_queries_say_is_written_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A doubt and a new run, which is recorded, though all queries were done before; a comparison has neither."""
+    scene, out, why = (
+        write_scene(tmp_path, queries=3),
+        tmp_path / "out",
+        "Taken together with b.png, it should be away.",
+    )
+
+    def judged(scene, rows, how, report, say):
+        report(1, 1)
+        trace = next(trace for _, trace in localize(scene, scene.queries[2:], *how[:3]))
+        yield rows[1].doubted(why), None
+        yield replace(rows[2], inliers=7), trace
+
+    assert run(scene, out, estimator="mc") == 0
+    monkeypatch.setattr("spherloc_viz.commands.localize.judged_together", judged)
+    capsys.readouterr()
+    assert run(scene, out, estimator="mc", records=Records(out / "recordings")) == 1
+    assert f"image1.png: {why.removesuffix('.')}" in capsys.readouterr().out
+    results = read_results(out)
+    assert results.status == ("localized", "doubtful", "localized") and results.rows[1].doubts == (why,)
+    assert [row["status"] for row in table(out)] == list(results.status) and table(out)[2]["inliers"] == "7"
+    assert json.loads((out / "summary.json").read_text())["doubtful"] == 1
+    assert results.recordings[1] is None and results.recordings[2] is not None and results.recordings[2].exists()
+    assert said_of("image1.png", results.rows[1], "m").endswith(why) and not results.rows[0].doubts
+    loaded = load_scene(scene)
+    assert isinstance(loaded, MapScene) and f"image1.png is doubtful: {why}" in sequence_html(results.rows, loaded)
+    assert compare_sequences({scene: [Solving("mc", (), tmp_path / "mc", None)]}, 0, (), False, tmp_path) == 0
 
 
 @pytest.mark.usefixtures("drawn")

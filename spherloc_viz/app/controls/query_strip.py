@@ -206,7 +206,7 @@ def _cell(view: View, picture: str, row: QueryResult | None, unit: str) -> str:
 
 
 def said_of(name: str, row: QueryResult | None, unit: str) -> str:
-    """A query's name and what became of it, in a line."""
+    """A query's name and what became of it, in a line, and what other queries or maps say against its pose."""
     if row is None:
         return name
     parts = [f"{name}: {row.status}"]
@@ -214,4 +214,4 @@ def said_of(name: str, row: QueryResult | None, unit: str) -> str:
         parts.append(f"{row.inliers} of {row.matches} matches")
     if row.translation_error_m is not None and row.rotation_error_deg is not None:
         parts.append(f"{row.translation_error_m:.2g} {unit}, {row.rotation_error_deg:.2g}° off")
-    return ", ".join(parts)
+    return ". ".join((", ".join(parts), *row.doubts))

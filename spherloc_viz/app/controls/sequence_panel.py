@@ -12,8 +12,9 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import SpherlocError, shorten
 from spherloc.experiments.kept_results import kept_results
 from spherloc.experiments.results import LOCALIZED, QueryResult
-from spherloc.experiments.sequence import localize
+from spherloc.experiments.sequence import How, localize
 from spherloc.experiments.summary import success_rates
+from spherloc.mapping.joint_outcome import judged_together
 from spherloc.trace import Trace
 from spherloc_viz.app.controls.query_strip import QueryStrip
 from spherloc_viz.app.text import ramp_html, status_html, table_html
@@ -22,6 +23,8 @@ from spherloc_viz.layers.primitives import Table
 from spherloc_viz.style import error_scale
 
 START, STOP = "Localize all queries", "Stop"
+MAX_DOUBTS = 4
+"""Largest number of queries of which is told why other queries or maps speak against them."""
 
 
 class SequencePanel:
@@ -139,6 +142,8 @@ class SequencePanel:
                 self._done(trace)
                 if stop.is_set():
                     break
+            else:
+                self._judge_together(label, scene, How(estimator, options, seed), stop)
         except SpherlocError as error:
             self._text.content = status_html(str(error), wrong=True)
         finally:
@@ -146,9 +151,22 @@ class SequencePanel:
             with self._lock:
                 self._stop = None
 
+    def _judge_together(self, label: str, scene: MapScene, how: How, stop: threading.Event) -> None:
+        """Judge the queries of a scene by each other, now that all are localized by themselves."""
+        for row, trace in judged_together(scene, self.rows(label), how):
+            with self._lock:
+                rows = tuple(row if one.query == row.query else one for one in self._rows[label])
+                self._rows[label] = rows
+            self._text.content = sequence_html(rows, scene)
+            self._follow()
+            self._done(trace)
+            if stop.is_set():
+                break
+
 
 def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
-    """How far the sequence is, how many succeed within each limit, and what the colours of the dots mean."""
+    """How far the sequence is, how many succeed within each limit, what the colours of the dots mean, and why queries
+    are doubted that are localized by themselves."""
     rates, unit = success_rates(rows, scene.thresholds), "m" if scene.metric else "units"
     lines = [
         (f"within {rate.degrees:g}° and {rate.metres:g} {unit}", f"{rate.successes} of {rate.judged}") for rate in rates
@@ -159,4 +177,10 @@ def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
     errors = [row.translation_error_m for row in rows if row.translation_error_m is not None]
     scale, small = (100.0, "cm") if scene.metric else (1.0, unit)
     worst = f"{scale * error_scale(np.array(errors), limit_m):.2g} {small}; red beyond {limit_m:g} {unit}"
-    return table_html(Table("sequence", ("", ""), (done, located, *lines))) + (ramp_html("0", worst) if errors else "")
+    doubts = [f"{row.query} is doubtful: {why}" for row in rows for why in row.doubts]
+    more = [f"And {len(doubts) - MAX_DOUBTS} more are."] if len(doubts) > MAX_DOUBTS else []
+    return (
+        table_html(Table("sequence", ("", ""), (done, located, *lines)))
+        + (ramp_html("0", worst) if errors else "")
+        + "".join(status_html(sentence) for sentence in (*doubts[:MAX_DOUBTS], *more))
+    )
