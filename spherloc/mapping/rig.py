@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.datasets.asl_layout import camera_of_folder
 from spherloc.datasets.imu import time_in_name
+from spherloc.datasets.query_gravity import time_of
 from spherloc.frontend.view import View
 from spherloc.geometry import align_to_down, camera_centre, pose, rotation_angle, yaw_rotation
 from spherloc.types import BoolArray, FloatArray
@@ -49,42 +51,70 @@ Shots = Mapping[str, tuple[str, int]]
 _NUMBERS = re.compile(r"\d+(?:\.\d+)?")
 
 
+@dataclass(frozen=True)
+class Key:
+    """What orders the images of a camera, and tells which were taken together."""
+
+    number: float
+    """A time in nanoseconds, or the longest number in a name; -1 without one."""
+    is_time: bool
+
+
 def shots_of(views: Sequence[View]) -> Shots:
     """Camera and time step of the images of cameras that took most of their images together, as names and times in them
-    say; none if there are no two such cameras. A panorama sees all around and is left out."""
-    keys: dict[str, dict[str, float]] = {}
+    or tables say; none if there are no two such cameras. A panorama sees all around and is left out."""
+    keys: dict[str, dict[str, Key]] = {}
     for view in views:
-        if not isinstance(view.camera, Equirectangular) and (named := _camera_and_key(view.name)):
-            keys.setdefault(named[0], {})[view.name] = named[1]
-    keys = {camera: images for camera, images in keys.items() if len(images) >= MIN_TOGETHER}
-    if len(keys) < 2:
+        if not isinstance(view.camera, Equirectangular):
+            camera, key = camera_and_key(view.name, time_of(view))
+            keys.setdefault(camera, {})[view.name] = key
+    return taken_together(keys)
+
+
+def taken_together(keys: Mapping[str, Mapping[str, Key]]) -> Shots:
+    """Camera and time step of the images of those cameras that took most of their images together, by the keys of each
+    camera's images by name."""
+    numbers = {
+        camera: {name: key.number for name, key in images.items() if key.number >= 0.0}
+        for camera, images in keys.items()
+    }
+    numbers = {camera: images for camera, images in numbers.items() if len(images) >= MIN_TOGETHER}
+    if len(numbers) < 2:
         return {}
-    reference = max(keys, key=lambda camera: len(keys[camera]))
-    steps = np.unique(list(keys[reference].values()))
+    reference = max(numbers, key=lambda camera: len(numbers[camera]))
+    steps = np.unique(list(numbers[reference].values()))
     if len(steps) < MIN_TOGETHER:
         return {}
     room = NEAR_IN_TIME * float(np.median(np.diff(steps)))
     found: dict[str, tuple[str, int]] = {}
-    for camera, images in keys.items():
-        nearest = {name: int(np.argmin(np.abs(steps - key))) for name, key in images.items()}
+    for camera, images in numbers.items():
+        nearest = {name: _nearest(steps, number) for name, number in images.items()}
         together = {name: step for name, step in nearest.items() if abs(steps[step] - images[name]) <= room}
         if len(set(together.values())) >= max(MIN_TOGETHER, SHARE_TOGETHER * min(len(images), len(steps))):
             found.update({name: (camera, step) for name, step in together.items()})
     return found if len({camera for camera, _ in found.values()}) > 1 else {}
 
 
-def _camera_and_key(name: str) -> tuple[str, float] | None:
+def _nearest(steps: FloatArray, number: float) -> int:
+    """Index of the nearest of growing ``steps`` (K,), the first of two."""
+    after = min(int(np.searchsorted(steps, number)), len(steps) - 1)
+    before = max(0, after - 1)
+    return before if abs(steps[before] - number) <= abs(steps[after] - number) else after
+
+
+def camera_and_key(name: str, time_ns: int | None = None) -> tuple[str, Key]:
     """The camera that a name tells, its folder or what is left of it without its longest number, and that number or
-    the time that it is; None without a number."""
+    the time that it is, if ``time_ns`` states no other."""
     path = PurePosixPath(name)
+    time_ns = time_in_name(name) if time_ns is None else time_ns
     numbers = list(_NUMBERS.finditer(path.stem))
-    if not numbers:
-        return None
-    key = max(numbers, key=lambda number: (len(number[0]), number.start()))
-    time_ns = time_in_name(name)
+    longest = max(numbers, key=lambda number: (len(number[0]), number.start()), default=None)
     folder = "" if path.parent == PurePosixPath(".") else str(path.parent)
-    camera = folder or path.stem[: key.start()] + path.stem[key.end() :]
-    return camera, float(key[0]) if time_ns is None else float(time_ns)
+    if path.parent.name != (camera := camera_of_folder(path.parent)):
+        folder = camera
+    rest = path.stem if longest is None else path.stem[: longest.start()] + path.stem[longest.end() :]
+    number = -1.0 if longest is None else float(longest[0])
+    return folder or rest, Key(number if time_ns is None else float(time_ns), time_ns is not None)
 
 
 def went_apart(poses: Mapping[str, FloatArray], shots: Shots) -> tuple[str, str] | None:
