@@ -178,7 +178,7 @@ def _about(
 ) -> str:
     """Which images are taken, and how to take more."""
     together = any(len(moment) > 1 for some in moments for moment in some)
-    which = f", those that {len(cameras)} cameras took together" if together else ""
+    which = f", of {len(cameras)} cameras at the same times" if together else ""
     if choice.mapped:
         return (
             f"{taken:,} of {there:,} images are localized{which}, the sharpest of each stretch that are not in the map."

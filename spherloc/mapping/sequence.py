@@ -97,8 +97,11 @@ def _gravity(sequence: AslSequence, shots: Sequence[_Shot]) -> tuple[StatedGravi
     if not found:
         none = f"{log}: is not used, as it has gravity of none of the {len(shots)} photographs"
         return None, [f"{none}: {_span(shots, samples.timestamps_ns)}."]
-    files = {str(shot.calibrated.file) for shot in shots if shot.calibrated is not None and shot.name in found}
-    remarks = [f"Gravity is from {log}; how the cameras are fixed to the IMU is from {_and(sorted(files))}."]
+    files = {
+        sequence.called(shot.calibrated.file) for shot in shots if shot.calibrated is not None and shot.name in found
+    }
+    places = f"how the cameras are fixed to the IMU is from {_and(sorted(files))}"
+    remarks = [f"Gravity is from {sequence.called(log)}; {places}."]
     if loose:
         remarks.append(f"No file says {_fixed(loose)}.")
     remarks += without_words(log, [shot.name for shot in shots if shot.name not in found], len(shots))
@@ -132,7 +135,7 @@ def _positions(sequence: AslSequence, shots: Sequence[_Shot]) -> tuple[Positions
             span = _span(shots, trajectory.poses.timestamps_ns)
             remarks.append(f"{table}: is not used for the scale, as {few}: {span}.")
             continue
-        told = f"The scale is from {table}, with positions of {len(found)} of {len(shots)} images"
+        told = f"The scale is from {sequence.called(table)}, with positions of {len(found)} of {len(shots)} images"
         remarks.append(f"{told}; {advice('other positions')}.")
         return Positions(found, f"the trajectory {name}/{TABLE}"), remarks
     return None, remarks

@@ -66,9 +66,9 @@ def sensor_yaml(matrix, focal=20.0):
     )
 
 
-def euroc(folder, rng, count=12, pictures=True):
+def euroc(folder, rng, count=12):
     """EuRoC: ``sensor.yaml`` with ``T_BS`` of every sensor, which are no identities."""
-    tree = _sequence(folder, rng, count, pictures)
+    tree = _sequence(folder, rng, count)
     for number, (camera, matrix) in enumerate(tree.body_from_camera.items()):
         (tree.mav / camera / "sensor.yaml").write_text(sensor_yaml(matrix, 20.0 + number))
     (tree.mav / "imu0" / "sensor.yaml").write_text(f"sensor_type: imu\n{_yaml(tree.body_from_imu)}rate_hz: 200\n")
@@ -82,7 +82,7 @@ def euroc(folder, rng, count=12, pictures=True):
 def tum_vi(folder, rng, count=12, key="T_cam_imu"):
     """TUM-VI: a Kalibr chain in ``dso``, and poses of the IMU. If ``key`` is T_cn_cnm1, the second camera is placed
     by the first alone."""
-    tree = _sequence(folder, rng, count, True)
+    tree = _sequence(folder, rng, count)
     imu_from = {name: np.linalg.inv(tree.body_from_imu) @ one for name, one in tree.body_from_camera.items()}
     text = ""
     for number, (camera, imu_from_camera) in enumerate(imu_from.items()):
@@ -108,7 +108,7 @@ def tum_vi(folder, rng, count=12, key="T_cam_imu"):
     return tree
 
 
-def _sequence(folder, rng, count, pictures):
+def _sequence(folder, rng, count):
     times = [START + STEP_NS * k for k in range(count)]
     body_from_camera = {
         f"cam{k}": transform(Rotation.random(random_state=k).as_matrix(), rng.normal(size=3)) for k in range(2)
@@ -133,10 +133,7 @@ def _sequence(folder, rng, count, pictures):
         images = tree.mav / camera / "data"
         images.mkdir(parents=True)
         for time in times:
-            if pictures:
-                cv2.imwrite(str(images / f"{time}.png"), rng.integers(0, 255, (SIZE[1], SIZE[0]), np.uint8))
-            else:
-                (images / f"{time}.png").write_bytes(b"")
+            cv2.imwrite(str(images / f"{time}.png"), rng.integers(0, 255, (SIZE[1], SIZE[0]), np.uint8))
         (images.parent / "data.csv").write_text(
             "#timestamp [ns],filename\r\n" + "".join(f"{time},{time}.png\r\n" for time in times)
         )

@@ -156,7 +156,7 @@ def test_the_sharpest_of_each_stretch_is_mapped_and_others_are_localized(tmp_pat
     }
     lost, choice, *_ = found.remarks
     assert "mav0/cam1/data.csv: 60 of its 120 rows name no image there" in lost
-    assert "24 of 180 images are mapped, those that 2 cameras took together" in choice
+    assert "24 of 180 images are mapped, of 2 cameras at the same times," in choice
     assert len({step for _, step in shots_of(found.views).values()}) == 12
     assert found.others == 156
     again = photographs(tmp_path, {}, choice=FrameChoice(12))
@@ -226,9 +226,11 @@ def test_cameras_that_took_nothing_together_are_chosen_from_one_by_one(tmp_path)
 
 
 def test_folders_that_are_no_sequence(tmp_path, rng):
-    tree = euroc(tmp_path / "room", rng, count=2, pictures=False)
+    tree = euroc(tmp_path / "room", rng, count=2)
     assert asl_sequence(tmp_path) is None and asl_sequence(tree.mav / "imu0") is None
     assert list(asl_sequence(tree.folder).cameras) == ["cam0", "cam1"]
+    (tree.mav / "cam2").mkdir()
+    assert "Without images in a folder data, and left out: cam2." in with_cameras(tree.folder, {}).remarks
     photos = tmp_path / "photos"
     (photos / "data").mkdir(parents=True)
     (photos / "data" / "1.png").write_bytes(b"")
