@@ -179,11 +179,11 @@ def _about(
     """Which images are taken, and how to take more."""
     together = any(len(moment) > 1 for some in moments for moment in some)
     which = f", of {len(cameras)} cameras at the same times" if together else ""
+    more = advice("more images")
     if choice.mapped:
-        return (
-            f"{taken:,} of {there:,} images are localized{which}, the sharpest of each stretch that are not in the map."
-        )
-    return f"{taken:,} of {there:,} images are mapped{which}, the sharpest of each stretch; {advice('more images')}."
+        sharpest = "the sharpest of each stretch that are not in the map"
+        return f"{taken:,} of {there:,} images are localized{which}, {sharpest}; {more}."
+    return f"{taken:,} of {there:,} images are mapped{which}, the sharpest of each stretch; {more}."
 
 
 def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], None]) -> int:

@@ -32,10 +32,13 @@ def new_images_of(
     mapped: Photographs,
     panorama: bool = False,
     choice: FrameChoice = FrameChoice(),  # noqa: B008 -- frozen
+    *,
+    imu: bool = True,
 ) -> tuple[NewImages, tuple[str, ...]]:
     """The images of a folder that are to be localized in the map of others, and remarks on those that cannot be.
 
-    Where they are many, those that ``choice`` takes, of a folder whose images were mapped in part the others.
+    Where they are many, those that ``choice`` takes, of a folder whose images were mapped in part the others. With
+    ``imu``, gravity of a sequence is that of its IMU.
 
     A calibration that lies beside images of its size is theirs, as for a map's own. Without one, they are of a camera
     of the map that has their size, which ``with_cameras`` tells by their names where it has several; others of 2 to 1
@@ -53,7 +56,7 @@ def new_images_of(
         raise InputError(f"{folder}: the camera of none of its images is known. {' '.join(found.remarks)}")
     all_there = only is not None and _all_of(folder, only) == [view.path for view in found.views]
     all_its = only is not None and all(_is(view.camera, only) for view in found.views)
-    data = sequence_data(folder, found.views, positions=False)
+    data = sequence_data(folder, found.views, gravity=imu, positions=False)
     gravity = {} if data.stated is None else data.stated.found
     remarks = (*found.remarks, *data.remarks)
     return NewImages(folder, None if all_there and all_its else found.views, gravity), remarks

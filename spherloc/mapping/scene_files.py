@@ -54,10 +54,10 @@ class MapHead:
     """The sections [gravity], [frontend] and [masks]."""
 
     def with_gravity(self, file: str) -> "MapHead":
-        """With a gravity file, beside the scene file."""
-        start = self.sections.index("[gravity]") + 1
-        line = f"file = {toml_text(file)}"
-        return replace(self, sections=(*self.sections[:start], line, *self.sections[start:]))
+        """With that gravity file, beside the scene file, and no other."""
+        lines = [line for line in self.sections if not line.startswith("file = ")]
+        lines.insert(lines.index("[gravity]") + 1, f"file = {toml_text(file)}")
+        return replace(self, sections=tuple(lines))
 
 
 def scene_text(head: MapHead, names: Sequence[str]) -> str:

@@ -120,7 +120,7 @@ def make(
             say(remark)
         others = None
         if new_images is not None:
-            others, remarks = new_images_of(new_images, found, panorama, choice)
+            others, remarks = new_images_of(new_images, found, panorama, choice, imu=gravity is None)
             for remark in remarks:
                 say(f"{new_images}: {remark}")
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")

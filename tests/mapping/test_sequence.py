@@ -1,6 +1,7 @@
 """Sequences in the layouts of EuRoC and TUM-VI: which images are mapped, and what is known of them."""
 
 import shutil
+import tomllib
 
 import cv2
 import numpy as np
@@ -166,10 +167,13 @@ def test_the_sharpest_of_each_stretch_is_mapped_and_others_are_localized(tmp_pat
     assert len(new.views) == 24 and not {view.path for view in new.views} & {view.path for view in found.views}
     assert "24 of 180 images are localized" in remarks[1] and "not in the map" in remarks[1]
     assert sorted(new.gravity) == sorted(view.name for view in new.views)
-    head = MapHead("m", "a", "..", 'units = "metres"', ("", "[gravity]", "map = [0.0, 0.0, -1.0]"))
+    assert not new_images_of(tree.mav, found, choice=FrameChoice(12), imu=False)[0].gravity
+    sections = ("", "[gravity]", "map = [0.0, 0.0, -1.0]", 'file = "mine.txt"')
+    head = MapHead("m", "a", "..", 'units = "metres"', sections)
     scene = write_new_scene(head, tmp_path, new, found.views[0].camera)
     rows = read_gravity_file(tmp_path / "mav0_gravity.txt")
-    assert 'file = "mav0_gravity.txt"' in scene.read_text() and rows.keys() == new.gravity.keys()
+    assert tomllib.loads(scene.read_text())["gravity"] == {"file": "mav0_gravity.txt", "map": [0.0, 0.0, -1.0]}
+    assert rows.keys() == new.gravity.keys()
     first = new.views[0].name
     assert off_deg(rows[first].down, tree.down_in(*cam_and_time(first))) < 0.5
     assert rows[first].bound_rad == pytest.approx(np.radians(2.0), rel=1e-3)
