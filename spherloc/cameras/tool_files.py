@@ -244,7 +244,7 @@ def read_kalibr_chain(path: str | Path) -> dict[str, KalibrCamera]:
                 (shift_s,) = numbers_of({"timeshift_cam_imu": 0.0} | table, "timeshift_cam_imu")
                 cam_from_imu, imu_from_cam = _rigid(table, "T_cam_imu"), _rigid(table, "T_imu_cam")
                 if cam_from_imu is None and imu_from_cam is not None:
-                    cam_from_imu = np.linalg.inv(imu_from_cam)
+                    cam_from_imu = np.asarray(np.linalg.inv(imu_from_cam), np.float64)
                 chain[name] = KalibrCamera(camera, cam_from_imu, _rigid(table, "T_cn_cnm1"), shift_s)
         return chain
 

@@ -170,6 +170,6 @@ def _of_chain(file: Path, sequence: AslSequence) -> dict[str, AslCamera]:
             else:
                 cam_from_imu = None
             if name in found and cam_from_imu is not None:
-                body_from_camera = np.asarray(body @ np.linalg.inv(cam_from_imu), np.float64)
+                body_from_camera = body @ np.linalg.inv(cam_from_imu)
                 found[name] = AslCamera(one.camera, file, body_from_camera, one.timeshift_s)
     return found

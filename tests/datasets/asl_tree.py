@@ -99,6 +99,8 @@ def tum_vi(folder, rng, count=12, key="T_cam_imu"):
             f"  distortion_coeffs: {coefficients}\n"
             f"  intrinsics: {[20.0 + number, *others]}\n  resolution: [{SIZE[0]}, {SIZE[1]}]\n"
         )
+    for path in tree.mav.glob("cam*/data/*.png"):  # of 16 bits
+        cv2.imwrite(str(path), 256 * cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(np.uint16))
     (folder / "dso" / "cam0").mkdir(parents=True)
     (folder / "dso" / "camchain.yaml").write_text(text)
     (folder / "dso" / "cam0" / "camera.txt").write_text("EquiDistant 0.373 0.373 0.498 0.499 0 0 0 0\n64 48\n")

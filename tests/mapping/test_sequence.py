@@ -11,6 +11,7 @@ from spherloc.datasets.asl import image_times
 from spherloc.datasets.asl_layout import asl_sequence
 from spherloc.datasets.query_gravity import read_gravity_file
 from spherloc.errors import InputError
+from spherloc.frontend.masks import Masks
 from spherloc.mapping.frames import FRAMES, FrameChoice, ImageFolder, chosen
 from spherloc.mapping.new_images import new_images_of
 from spherloc.mapping.photographs import photographs, with_cameras
@@ -53,6 +54,11 @@ def test_calibrations_gravity_and_positions_are_found(tmp_path, rng, write, key)
         gravity, scale = data.remarks
         assert "mav0/imu0/data.csv" in gravity and ("camchain.yaml" if key else "cam0/sensor.yaml") in gravity
         assert ("mocap0/data.csv" if key else "state_groundtruth_estimate0/data.csv") in scale
+    assert found.views[0].read().dtype == np.uint8
+    (tmp_path / "masks").mkdir()
+    cv2.imwrite(str(tmp_path / "masks" / "cam1.png"), 255 * np.eye(48, 64, dtype=np.uint8))
+    masked = photographs(tree.folder, {}, Masks(tmp_path / "masks")).views
+    assert [view.mask is None for view in (masked[0], masked[-1])] == [True, False]
     shots = shots_of(photographs(tree.folder, {}).views)
     assert {camera for camera, _ in shots.values()} == {"cam0", "cam1"} and len(shots) == 2 * len(tree.times)
 
