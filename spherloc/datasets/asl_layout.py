@@ -54,7 +54,7 @@ def asl_sequence(path: Path) -> AslSequence | None:
     if path.name == whole.name and path.parent.resolve() == whole.parent:
         whole = path  # as the user wrote it
     own, images = (whole.parent, path) if whole.name == DATA else (whole, path / DATA)
-    known = _CAMERA.fullmatch(own.name) or is_file(own / TABLE) or is_file(own / SENSOR)
+    known = _CAMERA.fullmatch(own.name) or is_file(own / SENSOR)
     if not known or not _has_images(images) or (images != path and _has_images(path)):
         return None
     return AslSequence(own.parent, {own.name: images})

@@ -11,7 +11,7 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.asl import asl_cameras, image_times
-from spherloc.datasets.asl_layout import DATA, AslSequence, asl_sequence
+from spherloc.datasets.asl_layout import DATA, SENSOR, AslSequence, asl_sequence
 from spherloc.datasets.given_path import SCENE, images_below, images_in_folders, what_it_is
 from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_folder, is_image, names_in
@@ -175,7 +175,11 @@ def _of_sequence(
         inside = "" if images == root else images.relative_to(root).as_posix()
         places.append(ImageFolder(inside, name, tuple(names_in(images)), times.times_ns))
         own = known.by_name.get(name)
-        calibrations[name] = FoundCalibrations({} if own is None else {sequence.called(own.file): own.camera})
+        if own is None:
+            others = [place / file for place in (images, images.parent) for file in names_in(place) if file != SENSOR]
+            calibrations[name] = _of_files(others)
+        else:
+            calibrations[name] = FoundCalibrations({sequence.called(own.file): own.camera})
         remarks += times.remarks
     return places, calibrations, remarks
 

@@ -39,7 +39,7 @@ def filled(folder, *names):
             "a map of some of them with: spherloc map ",
         ),
         (
-            ["data.csv", "data/1.png"],
+            ["sensor.yaml", "data/1.png"],
             "is a recorded sequence in the layout of EuRoC and TUM-VI, with 1 image of my photos; make a map of some",
         ),
         (["a.mp4"], "is a folder of 1 video; make a map of the frames of one with: spherloc map "),

@@ -18,7 +18,7 @@ from spherloc.mapping.photographs import photographs, with_cameras
 from spherloc.mapping.rig import shots_of
 from spherloc.mapping.scene_files import MapHead, write_new_scene
 from spherloc.mapping.sequence import sequence_data
-from tests.datasets.asl_tree import START, STEP_NS, euroc, tum_vi
+from tests.datasets.asl_tree import START, STEP_NS, euroc, sensor_yaml, tum_vi
 
 
 def off_deg(one, other):
@@ -80,6 +80,10 @@ def test_a_camera_without_a_calibration_is_told(tmp_path, rng):
     assert any(
         "cam1: It is left out: " in remark and "put their calibration beside" in remark for remark in found.remarks
     )
+    place = tree.mav / "cam1" / "data" / "lens.yaml"
+    place.write_text(sensor_yaml(np.eye(4), 23.0))
+    assert {view.camera.fx for view in with_cameras(tmp_path, {}).views} == {20.0, 23.0}
+    place.unlink()
     (tree.mav / "cam0" / "sensor.yaml").write_text("camera_model: unknown\nintrinsics: []\n")
     with pytest.raises(InputError, match=r"A file beside them is not used: .*cam0/sensor\.yaml"):
         photographs(tmp_path, {})
@@ -244,6 +248,7 @@ def test_folders_that_are_no_sequence(tmp_path, rng):
     photos = tmp_path / "photos"
     (photos / "data").mkdir(parents=True)
     (photos / "data" / "1.png").write_bytes(b"")
+    (photos / "data.csv").write_text("name,price\n")
     assert asl_sequence(photos) is None and asl_sequence(photos / "data") is None
     shutil.copytree(tree.mav, tmp_path / "left", dirs_exist_ok=True)
     (tmp_path / "left" / "1.png").write_bytes(b"")
