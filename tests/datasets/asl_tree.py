@@ -74,8 +74,9 @@ def euroc(folder, rng, count=12):
     (tree.mav / "imu0" / "sensor.yaml").write_text(f"sensor_type: imu\n{_yaml(tree.body_from_imu)}rate_hz: 200\n")
     truth = tree.mav / "state_groundtruth_estimate0"
     truth.mkdir()
-    (truth / "sensor.yaml").write_text(f"sensor_type: visual-inertial\n{_yaml(np.eye(4))}")
-    _write_truth(truth / "data.csv", tree, np.eye(4), ",0" * 9)
+    body_from_marker = transform(Rotation.random(random_state=8).as_matrix(), rng.normal(size=3))
+    (truth / "sensor.yaml").write_text(f"sensor_type: visual-inertial\n{_yaml(body_from_marker)}")
+    _write_truth(truth / "data.csv", tree, body_from_marker, ",0" * 9)
     return tree
 
 

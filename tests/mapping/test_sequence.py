@@ -231,6 +231,9 @@ def test_cameras_that_took_nothing_together_are_chosen_from_one_by_one(tmp_path)
     left, _ = chosen(tmp_path, [folders[0], ImageFolder("back", "back", folders[1].names[:280])], FrameChoice())
     both = {name[4:] for name in left[1].names}
     assert len(left[0].names) == FRAMES and both < {name[5:] for name in left[0].names} and len(both) >= FRAMES - 3
+    half = ImageFolder("back", "back", folders[1].names[::2])
+    left, _ = chosen(tmp_path, [folders[0], half], FrameChoice(FRAMES))
+    assert [len(one.names) for one in left] == [FRAMES, FRAMES], "each stretch has one that both took"
     others = ImageFolder("back", "back", tuple(f"b{k}.jpg" for k in range(1000, 1280)))
     left, (remark,) = chosen(tmp_path, [folders[0], others], FrameChoice())
     assert [len(one.names) for one in left] == [FRAMES, FRAMES] and "together" not in remark
