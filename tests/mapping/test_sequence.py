@@ -63,6 +63,16 @@ def test_calibrations_gravity_and_positions_are_found(tmp_path, rng, write, key)
     assert {camera for camera, _ in shots.values()} == {"cam0", "cam1"} and len(shots) == 2 * len(tree.times)
 
 
+def test_more_images_than_a_map_can_have_are_refused(tmp_path, rng, monkeypatch):
+    euroc(tmp_path, rng)
+    monkeypatch.setattr("spherloc.mapping.photographs.MAX_IMAGES", 20)
+    assert len(photographs(tmp_path, {}, choice=FrameChoice(10)).views) == 20
+    with pytest.raises(
+        InputError, match=r"24 photographs of all cameras are too many for a map, 20 at most; give fewer"
+    ):
+        photographs(tmp_path, {}, choice=FrameChoice(12))
+
+
 def test_what_is_asked_for_by_an_option_is_not_read(tmp_path, rng):
     tree = euroc(tmp_path, rng)
     views = photographs(tmp_path, {}).views
