@@ -69,6 +69,21 @@ def read_eighth(path: Path) -> ByteArray:
     return _decode(path, cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
+def read_reduced(path: Path, least_px: int) -> ByteArray:
+    """An image as grey bytes (H / N, W / N), N at most 8 and such that its longer side has ``least_px`` or more.
+
+    Raises ``InputError`` as ``read_image`` does.
+    """
+    longer = max(read_size(path))
+    flags = (
+        (8, cv2.IMREAD_REDUCED_GRAYSCALE_8),
+        (4, cv2.IMREAD_REDUCED_GRAYSCALE_4),
+        (2, cv2.IMREAD_REDUCED_GRAYSCALE_2),
+    )
+    flag = next((flag for divisor, flag in flags if longer >= divisor * least_px), cv2.IMREAD_GRAYSCALE)
+    return _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
+
+
 def grey(image: ByteArray) -> ByteArray:
     """Grey image (H, W) of a BGR or grey image."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)

@@ -182,6 +182,25 @@ def test_folders_of_cameras_are_offered_as_one_map_unless_a_link_leads_out(visit
         assert "not a folder of photographs" in visitor.said and visitor.panel._map._process is None
 
 
+def test_a_sequence_is_offered_as_one_map_unless_a_link_leads_out(visitor: Visitor, folder: Path) -> None:
+    for camera in ("cam0", "cam1"):
+        (folder / "room" / "mav0" / camera / "data").mkdir(parents=True)
+        for number in range(3):
+            (folder / "room" / "mav0" / camera / "data" / f"{number}.png").write_bytes(b"")
+    for place in ("0:room", "0:room/mav0"):
+        visitor.touch(f"open-folder:0:{place}")
+        assert f"map-folder:{place}" in visitor.rows
+        assert "Make a map of this sequence of cam0 and cam1, 6 images" in visitor.panel._list.content
+        assert "metres are from its ground truth" in visitor.panel._list.content
+    visitor.touch("open-folder:0:0:room/mav0/cam1")
+    assert "Make a map of this sequence of cam1, 3 images" in visitor.panel._list.content
+    outside = folder.parent / "elsewhere"
+    (folder / "room" / "mav0" / "cam1" / "data").rename(outside)
+    (folder / "room" / "mav0" / "cam1" / "data").symlink_to(outside)
+    visitor.touch("open-folder:0:0:room")
+    assert "Make a map" not in visitor.panel._list.content
+
+
 def test_photographs_are_localized_in_the_map_at_hand(visitor: Visitor, folder: Path, rng: np.random.Generator) -> None:
     """They become queries of a scene beside the map's own, which is opened."""
     own, later = [f"seq/{k:03}.jpg" for k in range(4)], ["image_0.png", "image_1.png"]

@@ -221,7 +221,7 @@ class KalibrCamera:
     camera: Camera
     """Its model, with the principal point in this project's convention."""
     cam_from_imu: FloatArray | None
-    """``T_cam_imu`` (4, 4), metres; None if the file has none."""
+    """``T_cam_imu``, or the inverse of ``T_imu_cam`` (4, 4), metres; None if the file has none."""
     cam_from_previous: FloatArray | None
     """``T_cn_cnm1`` (4, 4), metres, from the camera before it in the chain; None if the file has none."""
     timeshift_s: float = 0.0
@@ -242,8 +242,27 @@ def read_kalibr_chain(path: str | Path) -> dict[str, KalibrCamera]:
             camera = camera_of(name, table)
             with located(name):
                 (shift_s,) = numbers_of({"timeshift_cam_imu": 0.0} | table, "timeshift_cam_imu")
-                chain[name] = KalibrCamera(camera, _rigid(table, "T_cam_imu"), _rigid(table, "T_cn_cnm1"), shift_s)
+                cam_from_imu, imu_from_cam = _rigid(table, "T_cam_imu"), _rigid(table, "T_imu_cam")
+                if cam_from_imu is None and imu_from_cam is not None:
+                    cam_from_imu = np.asarray(np.linalg.inv(imu_from_cam), np.float64)
+                chain[name] = KalibrCamera(camera, cam_from_imu, _rigid(table, "T_cn_cnm1"), shift_s)
         return chain
+
+
+def read_body_from_sensor(path: Path) -> FloatArray | None:
+    """``T_BS`` (4, 4), metres, of a ``sensor.yaml``: p_body = T_BS p_sensor; None if the file has none.
+
+    Raises ``CalibrationError``, naming the file, if it cannot be read or its ``T_BS`` is no rigid transform.
+    """
+    with located(str(path)):
+        table = parse_yaml(read_text(path))
+        if not isinstance(table, dict) or "T_BS" not in table:
+            return None
+        matrix = table["T_BS"]
+        if isinstance(matrix, dict):  # OpenCV's form
+            numbers = list(list_of(matrix, "data", ", ".join(f"m{k}" for k in range(16))))
+            matrix = [numbers[row : row + 4] for row in range(0, 16, 4)]
+        return _rigid({"T_BS": matrix}, "T_BS")
 
 
 def chain_tables(document: Any) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from spherloc.datasets.asl_layout import AslSequence, asl_sequence
 from spherloc.errors import InputError, shorten
 from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in, read_file
 
@@ -81,6 +82,11 @@ def _folder(path: Path) -> tuple[str, str]:
     except InputError:
         return "a folder that cannot be listed", SCENE
     suffixes = Counter(Path(name).suffix.lower() for name in names)
+    if (sequence := asl_sequence(path)) is not None:
+        *others, last = images_of_cameras(sequence).items()
+        counts = f"{', '.join(_of_camera(*one) for one in others)}{' and ' if others else ''}{_of_camera(*last)}"
+        what = f"a recorded sequence in the layout of EuRoC and TUM-VI, with {counts}"
+        return what, f"make a map of some of them with: spherloc map {_quoted(path)}"
     stems = {Path(name).stem for name in names if Path(name).suffix in (".bin", ".txt")}
     if stems >= {"cameras", "images", "points3D"}:
         return "a COLMAP model", _COLMAP
@@ -128,6 +134,15 @@ def _images(names: Sequence[str]) -> int:
     return sum(is_image(name) for name in names)
 
 
+def _of_camera(name: str, count: int) -> str:
+    return f"{count:,} image{'' if count == 1 else 's'} of {name}"
+
+
+def images_of_cameras(sequence: AslSequence) -> dict[str, int]:
+    """Number of images of each camera of a sequence."""
+    return {name: _images(names_in(folder)) for name, folder in sequence.cameras.items()}
+
+
 def images_in_folders(path: Path, names: Sequence[str], most: int | None = None) -> dict[str, int]:
     """Number of images in each subfolder that has some, by its name; of at most ``most`` folders if that is given."""
     counts = {}
@@ -140,7 +155,8 @@ def images_in_folders(path: Path, names: Sequence[str], most: int | None = None)
 
 
 def images_below(path: Path) -> tuple[Path, int] | None:
-    """A folder in ``path``, at any depth, that has two images or more, or that has several such folders, and how many.
+    """A folder in ``path``, at any depth, that has two images or more, or that has several such folders or a sequence
+    in the ASL layout, and how many.
 
     The one that is least deep, the first by name; None if there is none among the first ``MAX_FOLDERS`` folders.
     """
@@ -150,6 +166,8 @@ def images_below(path: Path) -> tuple[Path, int] | None:
             names = [name for name in names_in(place) if not name.startswith(".")]
         except InputError:
             continue
+        if (sequence := asl_sequence(place)) is not None and (count := sum(images_of_cameras(sequence).values())) > 1:
+            return place, count
         inside = [count for count in images_in_folders(place, names, MAX_FOLDERS).values() if count > 1]
         count = sum(inside) if len(inside) > 1 else _images(names)
         if count > 1:

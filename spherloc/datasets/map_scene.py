@@ -275,7 +275,7 @@ class MapSettings:
         if self.masks is not None:
             given, asked = self._masked(path, given, asked, remarks)
         gravity = self.gravity
-        known, said = gravity.of_queries(asked, gravity_map)
+        known, said = gravity.of_queries(asked, gravity_map, given)
         matcher = others.get("matcher")
         if matcher is None:
             others["matcher"] = image_matcher(given, self.frontend, str(path), path.parent)

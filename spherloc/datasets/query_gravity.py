@@ -30,6 +30,9 @@ SOURCES = ("reference", "lines", "tags", "level", "truth")
 _KEYS = {"bound_deg", "sd_deg", "file", "query", "map_bound_deg"}
 BOUND_SD = 3.0
 """Number of standard deviations that make a bound."""
+ROUNDED_NS = 1_000
+"""Nanoseconds in a name are taken for a time that is stated in seconds if they differ by less: a double of seconds
+since 1970 is rounded to a quarter of a microsecond."""
 _MAX_SD_DEG = 25.0
 _ROW = re.compile(r'(?:"([^"]+)"|([^\s,"]+))[\s,]+(.*)')
 _COLUMNS = "image gx gy gz [sd_deg]"
@@ -46,7 +49,7 @@ class ImuLog:
 
     def with_gravity(self, views: tuple[View, ...]) -> tuple[View, ...]:
         """The views, with gravity where they have a time within the log and no gravity yet."""
-        times = [_time_ns(view) for view in views]
+        times = [time_of(view) for view in views]
         down = down_at(self.samples, np.array([0 if time is None else time for time in times], dtype=np.int64))
         down = down @ self.camera_from_imu.T
         known = [time is not None and bool(np.isfinite(row).all()) for time, row in zip(times, down, strict=True)]
@@ -58,9 +61,13 @@ class ImuLog:
         )
 
 
-def _time_ns(view: View) -> int | None:
-    """When a view was taken, as the loader states it or as the name of its image says; None if neither does."""
-    return round(view.timestamp_s * NS_PER_S) if view.timestamp_s is not None else time_in_name(view.name)
+def time_of(view: View) -> int | None:
+    """When a view was taken, ns, as the loader states it or as the name of its image says; None if neither does."""
+    by_name = time_in_name(view.name)
+    if view.timestamp_s is None:
+        return by_name
+    stated = round(view.timestamp_s * NS_PER_S)
+    return by_name if by_name is not None and abs(by_name - stated) < ROUNDED_NS else stated
 
 
 @dataclass(frozen=True)
@@ -84,15 +91,18 @@ class GravitySettings:
     imu: ImuLog | None = None
     """Log of an inertial measurement unit that is fixed to the camera; None if there is none."""
 
-    def of_queries(self, views: Iterable[View], gravity_map: FloatArray) -> tuple[tuple[View, ...], list[str]]:
+    def of_queries(
+        self, views: Iterable[View], gravity_map: FloatArray, references: Iterable[View] = ()
+    ) -> tuple[tuple[View, ...], list[str]]:
         """The queries with their gravity, as far as it is known before they are read, and remarks on the others.
 
-        ``gravity_map`` (3,) is the unit vector that points down in the map.
+        ``gravity_map`` (3,) is the unit vector that points down in the map; rows of the gravity file may be of
+        ``references``, too.
         """
         queries = tuple(self._with_gravity(view, gravity_map) for view in views)
         if self.imu is not None:
             queries = self.imu.with_gravity(queries)
-        names = {view.name for view in queries}
+        names = {view.name for view in (*queries, *references)}
         remarks, strange = [], [name for name in self.stated if name not in names]
         without = [view.name for view in queries if self.file and view.name not in self.stated]
         if strange:

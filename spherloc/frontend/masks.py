@@ -92,7 +92,9 @@ class Masks:
 
 def _in_folder(folder: Path, name: str) -> Path | None:
     own = PurePosixPath(name)
-    cameras = [parent.with_name(f"{parent.name}.png") for parent in own.parents if parent.name]
+    parents = [parent for parent in own.parents if parent.name]
+    cameras = [parent.with_name(f"{parent.name}.png") for parent in parents]
+    cameras += [PurePosixPath(f"{parent.name}.png") for parent in parents]  # of cam0/data: cam0.png
     for candidate in (own.with_name(f"{own.name}.png"), own.with_suffix(".png"), own, *cameras):
         if is_file(folder / candidate):
             return folder / candidate

@@ -18,6 +18,9 @@ COMMAND = {
     "report again": "make room there and give the same command for the report",
     "sideways": "--gravity FILE says where down is",
     "another map": "give another folder with --output, or remove that one",
+    "more images": "--frames says how many of each camera",
+    "other positions": "--positions, --distance or --camera-height goes before it",
+    "fewer images": "give fewer --frames",
 }
 PAGE = {
     "calibration": "put {files} beside them, into that folder, and make the map again",
@@ -33,6 +36,9 @@ PAGE = {
     "report again": "make room there and make the map again for the report",
     "sideways": "if so, make the map with the command spherloc map, which takes a file of gravity",
     "another map": "remove that folder, or rename that of the photographs",
+    "more images": "the command spherloc map takes more",
+    "other positions": "a Scale that you give goes before it",
+    "fewer images": "take fewer folders of cameras",
 }
 _words: ContextVar[Mapping[str, str]] = ContextVar("advice", default=COMMAND)
 

@@ -49,8 +49,9 @@ def jumps(rows: Sequence[QueryResult], limit: float) -> Mapping[str, Jump]:
     """
     sequences: dict[str, list[tuple[float, QueryResult]]] = {}
     for row in rows:
-        if named := camera_and_key(row.query):
-            sequences.setdefault(named[0], []).append((named[1], row))
+        camera, key = camera_and_key(row.query)
+        if key.number >= 0.0:
+            sequences.setdefault(camera, []).append((key.number, row))
     found: dict[str, Jump] = {}
     for known in sequences.values():
         sure = sorted(((key, row) for key, row in known if row.status == LOCALIZED), key=lambda item: item[0])

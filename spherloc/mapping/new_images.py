@@ -1,6 +1,7 @@
 """The images that are to be localized in a map, with their cameras: those of the map or others."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from spherloc.cameras.base import Camera
@@ -8,9 +9,11 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.given_path import ARCHIVES, what_it_is
 from spherloc.errors import InputError
 from spherloc.files import is_file, is_folder, is_image, names_in
-from spherloc.frontend.view import View
+from spherloc.frontend.view import Gravity, View
 from spherloc.images import read_size
+from spherloc.mapping.frames import FrameChoice
 from spherloc.mapping.photographs import Photographs, cameras_of, with_cameras
+from spherloc.mapping.sequence import sequence_data
 
 
 @dataclass(frozen=True)
@@ -20,10 +23,22 @@ class NewImages:
     folder: Path
     views: tuple[View, ...] | None
     """With their cameras, named by the path in the folder; None for all images there, of the map's one camera."""
+    gravity: Mapping[str, Gravity] = field(default_factory=dict)
+    """That of a sequence's IMU, by name."""
 
 
-def new_images_of(folder: Path, mapped: Photographs, panorama: bool = False) -> tuple[NewImages, tuple[str, ...]]:
+def new_images_of(
+    folder: Path,
+    mapped: Photographs,
+    panorama: bool = False,
+    choice: FrameChoice = FrameChoice(),  # noqa: B008 -- frozen
+    *,
+    imu: bool = True,
+) -> tuple[NewImages, tuple[str, ...]]:
     """The images of a folder that are to be localized in the map of others, and remarks on those that cannot be.
+
+    Where they are many, those that ``choice`` takes, of a folder whose images were mapped in part the others. With
+    ``imu``, gravity of a sequence is that of its IMU.
 
     A calibration that lies beside images of its size is theirs, as for a map's own. Without one, they are of a camera
     of the map that has their size, which ``with_cameras`` tells by their names where it has several; others of 2 to 1
@@ -35,12 +50,16 @@ def new_images_of(folder: Path, mapped: Photographs, panorama: bool = False) -> 
         raise InputError(f"{folder}: is not a folder; give one with images that are to be localized.")
     different = cameras_of(mapped.views)
     only = next(iter(different.values())) if len(different) == 1 else None
-    found = with_cameras(folder, {}, panorama, of_map=mapped.cameras if only is None else {"": only})
+    choice = replace(choice, mapped=frozenset(view.path.resolve() for view in mapped.views))
+    found = with_cameras(folder, {}, panorama, None, mapped.cameras if only is None else {"": only}, choice)
     if not found.views:
         raise InputError(f"{folder}: the camera of none of its images is known. {' '.join(found.remarks)}")
     all_there = only is not None and _all_of(folder, only) == [view.path for view in found.views]
     all_its = only is not None and all(_is(view.camera, only) for view in found.views)
-    return NewImages(folder, None if all_there and all_its else found.views), found.remarks
+    data = sequence_data(folder, found.views, gravity=imu, positions=False)
+    gravity = {} if data.stated is None else data.stated.found
+    remarks = (*found.remarks, *data.remarks)
+    return NewImages(folder, None if all_there and all_its else found.views, gravity), remarks
 
 
 def _all_of(folder: Path, camera: Camera) -> list[Path]:

@@ -5,6 +5,7 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from spherloc.datasets.asl_layout import camera_of_folder
 from spherloc.datasets.scene_file import read_table, section
 from spherloc.errors import InputError, StoppedError, reason
 from spherloc.files import is_folder
@@ -12,7 +13,15 @@ from spherloc.formats.colmap_files import read_model
 from spherloc.frontend.view import View
 from spherloc.mapping.new_images import new_images_of
 from spherloc.mapping.photographs import Photographs, cameras_of, with_cameras
-from spherloc.mapping.scene_files import MODEL, UNITS_METRES, UNITS_UNKNOWN, MapHead, toml_value, write_new_scene
+from spherloc.mapping.scene_files import (
+    GRAVITY,
+    MODEL,
+    UNITS_METRES,
+    UNITS_UNKNOWN,
+    MapHead,
+    toml_value,
+    write_new_scene,
+)
 
 SECTIONS = ("gravity", "frontend", "masks")
 """Sections of a scene file that are the same for all queries of a map."""
@@ -48,6 +57,9 @@ def add_new_images(scene: Path, folder: Path) -> tuple[Path, tuple[str, ...]]:
         raise InputError(f"{scene.name}: is not the scene of a map; open one that spherloc map made, or the page.")
     mapped = _mapped(scene.parent / MODEL, images)
     new_images, remarks = new_images_of(folder, mapped)
+    gravity_of_map = table.get("gravity")
+    if isinstance(gravity_of_map, dict) and gravity_of_map.get("file") == GRAVITY:
+        table = table | {"gravity": {key: value for key, value in gravity_of_map.items() if key != "file"}}
     head = MapHead(
         name=_name(table),
         about=str(table.get("about", "")),
@@ -78,7 +90,8 @@ def _mapped(model_folder: Path, images: Path) -> Photographs:
         return Photographs(views, (), {})
     folders: dict[str, list[View]] = {}
     for view in views:
-        folders.setdefault(PurePosixPath(view.name).parent.as_posix(), []).append(view)
+        inside = PurePosixPath(view.name).parent
+        folders.setdefault("." if inside == PurePosixPath() else camera_of_folder(inside), []).append(view)
     if "." not in folders and all(len(cameras_of(some)) == 1 for some in folders.values()):
         return Photographs(views, (), {name: some[0].camera for name, some in folders.items()})
     with suppress(InputError):  # of cameras that were given when the map was made, nothing lies beside the images

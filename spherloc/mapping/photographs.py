@@ -1,31 +1,31 @@
-"""The photographs from which a map is made: a folder's images with their cameras, or the sharpest frames of a video."""
+"""The photographs from which a map is made: a folder's images with their cameras."""
 
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import ceil
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.datasets.asl import asl_cameras, image_times
+from spherloc.datasets.asl_layout import DATA, SENSOR, AslSequence, asl_sequence
 from spherloc.datasets.given_path import SCENE, images_below, images_in_folders, what_it_is
 from spherloc.errors import InputError, SpherlocError, shorten
-from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in, write_whole
+from spherloc.files import IMAGES, is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
 from spherloc.images import check_image, grey, read_eighth, read_image
 from spherloc.mapping.advice import advice
+from spherloc.mapping.frames import MAX_IMAGES, FrameChoice, ImageFolder, chosen
 from spherloc.mapping.image_circle import BLACK
 from spherloc.mapping.lens import about_principal_point, for_colmap
+from spherloc.trajectory import NS_PER_S
 from spherloc.types import ByteArray
 
 MIN_IMAGES = 2
-MAX_IMAGES = 500
-"""Largest number of images of a map: the features of each take 4 MB."""
 MIN_PANORAMA_PX = 200
 """Least length of the longer side of a panorama."""
 MIN_REDUCED_PX = 1024
@@ -39,8 +39,6 @@ CALLED_CALIBRATION = re.compile("calib|camera|camchain|intrinsic|sensor|lens|cam
 """Names of files that are taken for calibrations, so that one that cannot be read is told."""
 MAX_CALIBRATIONS = 20
 """Largest number of files beside the photographs that are tried as a calibration."""
-SHARPNESS_PX = 512
-"""Frames are scaled to this longer side before their sharpness is compared."""
 
 CalibratedLens = tuple[Camera, str]
 """A lens that was calibrated by the images that it took, and how, in sentences."""
@@ -59,6 +57,8 @@ class Photographs:
     """The calibrations that were given or found, by name or by the folder of their images."""
     calibrated: Mapping[str, CalibratedLens] = field(default_factory=dict)
     """Those that the images themselves told, by their folder in that of the map; empty for that itself."""
+    others: int = 0
+    """Number of images that were not looked at, since enough others were chosen."""
 
 
 def photographs(
@@ -67,12 +67,13 @@ def photographs(
     masks: Masks | None = None,
     panorama: bool = False,
     find_lens: LensFinder | None = None,
+    choice: FrameChoice = FrameChoice(),  # noqa: B008 -- frozen
 ) -> Photographs:
     """The images from which a map can be made: ``with_cameras``, without the pixels that ``masks`` leave out.
 
     Raises ``InputError`` as that does, and if there are fewer than two images or too many, or if no image has a mask.
     """
-    found = with_cameras(folder, cameras, panorama, find_lens)
+    found = with_cameras(folder, cameras, panorama, find_lens, choice=choice)
     views, remarks = found.views, found.remarks
     if len(views) < MIN_IMAGES:
         raise InputError(
@@ -81,13 +82,13 @@ def photographs(
         )
     if len(views) > MAX_IMAGES:
         raise InputError(
-            f"{folder}: has {len(views)} photographs, more than {MAX_IMAGES}; take every n-th of them, or map "
-            'them with COLMAP and open its model as kind = "colmap".'
+            f"{folder}: {len(views)} photographs of all cameras are too many for a map, {MAX_IMAGES} at "
+            f'most; {advice("fewer images")}, or map them with COLMAP and open its model as kind = "colmap".'
         )
     if masks is None:
         return found
     masked, without = masks.on(views)
-    return Photographs(tuple(masked), (*remarks, *without), found.cameras, found.calibrated)
+    return replace(found, views=tuple(masked), remarks=(*remarks, *without))
 
 
 def with_cameras(
@@ -96,8 +97,10 @@ def with_cameras(
     panorama: bool = False,
     find_lens: LensFinder | None = None,
     of_map: Mapping[str, Camera] | None = None,
+    choice: FrameChoice = FrameChoice(),  # noqa: B008 -- frozen
 ) -> Photographs:
-    """The images of a folder or, if it has none, of the folders in it, with their cameras.
+    """The images of a folder or, if it has none, of the folders in it, with their cameras; of a sequence in the ASL
+    layout those of its cameras. Where they are many, those that ``chosen`` takes by ``choice``.
 
     ``cameras`` are those of a calibration file, by name; without them, calibrations beside the images are taken, and
     for a folder in ``folder`` also one beside it that has its name, or a file there with several cameras. A single
@@ -114,37 +117,71 @@ def with_cameras(
     if not is_folder(folder):
         raise InputError(_known(folder) or f"{folder}: is not a folder; give the folder of the photographs.")
     there = names_in(folder)
-    inside = images_in_folders(folder, [name for name in there if not is_image(name)])
-    views: list[View] = []
+    sequence = asl_sequence(folder)
+    inside = {} if sequence else images_in_folders(folder, [name for name in there if not is_image(name)])
     remarks: list[str] = []
+    own: dict[str, FoundCalibrations] = {}
+    if sequence is not None:
+        places, own, remarks = _of_sequence(folder, sequence)
+    elif any(is_image(name) for name in there) or not inside:
+        places = [ImageFolder("", "", tuple(there))]
+    else:
+        places = [ImageFolder(name, name, tuple(names_in(folder / name))) for name in sorted(inside)]
+    there_are = sum(len(place.names) for place in places)
+    places, about_choice = chosen(folder, places, choice)
+    others = there_are - sum(len(place.names) for place in places)
+    remarks += about_choice
     known = dict(cameras)
+    views: list[View] = []
     calibrated: dict[str, CalibratedLens] = {}
-    if any(is_image(name) for name in there) or not inside:
+    if sequence is None and not places[0].inside:
         beside = calibrations_in(folder)
         known = known or dict(beside.cameras)
-        views, remarks, lens = _of_folder(folder, "", cameras, beside, panorama, find_lens, of_map)
+        views, about, lens = _of_folder(folder, places[0], cameras, beside, panorama, find_lens, of_map)
         calibrated |= {} if lens is None else {"": lens}
-        remarks += _about_subfolders(inside)
-    else:
-        folders = sorted(inside)
-        shared = _of_files([folder / name for name in there], least=2).cameras
-        for name in folders:
-            try:
-                given, common = (_belonging(some, name, folders) for some in (cameras, shared))
-                mapped = None if of_map is None else _belonging(of_map, name, folders)
-                beside = calibrations_in(folder, name)
-                if not beside.cameras:
-                    beside = replace(beside, cameras=common)
-                found, about, lens = _of_folder(folder, name, given, beside, panorama, find_lens, mapped)
-                calibrated |= {} if lens is None else {name: lens}
-            except InputError as error:
-                found, about = [], [f"It is left out: {error}"]
-            views += found
-            if len(cameras_of(found)) == 1:
-                known[name] = found[0].camera
-            remarks += [f"{shorten(name)}: {remark}" for remark in about]
-        remarks += _about_deeper(folder, [name for name in there if name not in inside])
-    return Photographs(tuple(views), tuple(remarks), known, calibrated)
+        remarks += [*about, *_about_subfolders(inside)]
+        return Photographs(tuple(views), tuple(remarks), known, calibrated, others)
+    folders = [place.camera for place in places]
+    shared = {} if sequence else _of_files([folder / name for name in there], least=2).cameras
+    for place in places:
+        try:
+            given, common = (_belonging(some, place.camera, folders) for some in (cameras, shared))
+            mapped = None if of_map is None else _belonging(of_map, place.camera, folders)
+            beside = own[place.camera] if sequence else calibrations_in(folder, place.camera)
+            if not beside.cameras:
+                beside = replace(beside, cameras=common)
+            found, about, lens = _of_folder(folder, place, given, beside, panorama, find_lens, mapped)
+            calibrated |= {} if lens is None else {place.camera if place.inside else "": lens}
+        except InputError as error:
+            found, about = [], [f"It is left out: {error}"]
+        views += found
+        if len(cameras_of(found)) == 1:
+            known[place.camera] = found[0].camera
+        remarks += [f"{shorten(place.camera)}: {remark}" for remark in about]
+    remarks += [] if sequence else _about_deeper(folder, [name for name in there if name not in inside])
+    return Photographs(tuple(views), tuple(remarks), known, calibrated, others)
+
+
+def _of_sequence(
+    root: Path, sequence: AslSequence
+) -> tuple[list[ImageFolder], dict[str, "FoundCalibrations"], list[str]]:
+    """The image folders of a sequence in ``root``, their calibrations by the name of the camera, and remarks."""
+    known = asl_cameras(sequence)
+    places, calibrations, remarks = [], {}, list(known.remarks)
+    if sequence.empty:
+        remarks.append(f"Without images in a folder {DATA}, and left out: {_some(sequence.empty)}.")
+    for name, images in sequence.cameras.items():
+        times = image_times(images)
+        inside = "" if images == root else images.relative_to(root).as_posix()
+        places.append(ImageFolder(inside, name, tuple(names_in(images)), times.times_ns))
+        own = known.by_name.get(name)
+        if own is None:
+            others = [place / file for place in (images, images.parent) for file in names_in(place) if file != SENSOR]
+            calibrations[name] = _of_files(others)
+        else:
+            calibrations[name] = FoundCalibrations({sequence.called(own.file): own.camera})
+        remarks += times.remarks
+    return places, calibrations, remarks
 
 
 def cameras_of(views: Sequence[View]) -> dict[str, Camera]:
@@ -167,24 +204,24 @@ def _belonging(cameras: Mapping[str, Camera], folder: str, folders: Sequence[str
 
 def _of_folder(
     root: Path,
-    inside: str,
+    place: ImageFolder,
     given: Mapping[str, Camera],
     beside: "FoundCalibrations",
     panorama: bool,
     find_lens: LensFinder | None,
     of_map: Mapping[str, Camera] | None,
 ) -> tuple[list[View], list[str], CalibratedLens | None]:
-    """The images of the folder ``inside`` of ``root``, or of ``root`` itself if that is empty, remarks on others, and
-    the camera that ``find_lens`` found, if it was needed.
+    """The images of a folder in ``root``, or of ``root`` itself, remarks on others, and the camera that ``find_lens``
+    found, if it was needed.
 
     ``given`` are the cameras that the user gave, ``beside`` those of files beside the images, ``of_map`` those of the
     map in which the images are to be localized, else None. Raises ``InputError`` if it has no images, or if their
     camera is unknown or, without ``of_map``, has no model in COLMAP.
     """
-    folder = root / inside
+    folder = root / place.inside
     sizes: dict[tuple[int, int], list[str]] = {}
     damaged, others = [], []
-    for name in names_in(folder):
+    for name in place.names:
         if not is_image(name):
             others.append(name)
             continue
@@ -253,10 +290,12 @@ def _of_folder(
         if repr(camera) not in for_model:
             for_model[repr(camera)], about_lens = for_colmap(camera) if of_map is None else (camera, "")
             remarks += [about_lens] if about_lens else []
-    views = [
-        View((Path(inside) / name).as_posix(), for_model[repr(camera_of[name])], folder / name)
-        for name in sorted(camera_of)
-    ]
+    views = []
+    for name in sorted(camera_of):
+        time_ns = place.times_ns.get(name)
+        time_s = None if time_ns is None else time_ns / NS_PER_S
+        camera = for_model[repr(camera_of[name])]
+        views.append(View(place.name_of(name), camera, folder / name, timestamp_s=time_s))
     return views, remarks, lens
 
 
@@ -438,60 +477,3 @@ def two_circles(image: ByteArray) -> bool:
             if np.percentile(corners, 90) > BLACK or between.mean() <= 2 * BLACK:
                 return False
     return True
-
-
-def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], None]) -> int:
-    """Write about ``count`` frames of a video into ``folder``, which is made, and return their number.
-
-    The video is divided into equal pieces, of which the sharpest frame each is written. ``advance`` is called after
-    each frame with its file name. Existing frames are not written again. Raises ``InputError`` if the video cannot be
-    read or the folder cannot be written.
-    """
-    if not is_file(video):
-        raise InputError(f"{video}: is not a file; give a video.")
-    reader = cv2.VideoCapture(str(video))
-    total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
-    if total <= 0:
-        raise InputError(f"{video}: OpenCV cannot read it as a video; convert it, to MP4 with H.264 for instance.")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror}); give another folder.") from None
-    stretch = max(1, ceil(total / count))
-    written = 0
-    for number, frame in _sharpest(reader, stretch):
-        name = f"frame_{number:06d}.jpg"
-        path = folder / name
-        if not is_file(path):
-            done, content = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 95])
-            try:
-                write_whole(path, content.tobytes() if done else b"")
-            except OSError as error:
-                raise InputError(f"{path}: cannot be written ({error.strerror}); give another folder.") from None
-        written += 1
-        advance(name)
-    return written
-
-
-def _sharpest(reader: cv2.VideoCapture, stretch: int) -> Iterator[tuple[int, ByteArray]]:
-    """Number and pixels of the sharpest frame of each ``stretch`` frames."""
-    best: tuple[float, int, ByteArray] | None = None
-    number = 0
-    while True:
-        there, frame = reader.read()
-        if best is not None and (not there or number % stretch == 0):
-            yield best[1], best[2]
-            best = None
-        if not there:
-            return
-        sharpness = _sharpness(np.asarray(frame, np.uint8))
-        if best is None or sharpness > best[0]:
-            best = sharpness, number, np.asarray(frame, np.uint8)
-        number += 1
-
-
-def _sharpness(frame: ByteArray) -> float:
-    """Variance of the Laplacian at ``SHARPNESS_PX``."""
-    scale = min(1.0, SHARPNESS_PX / max(frame.shape[:2]))
-    small = cv2.resize(grey(frame), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return float(cv2.Laplacian(small, cv2.CV_32F).var())

@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from spherloc.datasets.imu import NAME_RULE, time_in_name
+from spherloc.datasets.imu import NAME_RULE
+from spherloc.datasets.query_gravity import time_of
 from spherloc.errors import InputError, shorten, show
 from spherloc.files import open_file, reading
 from spherloc.formats.text_rows import finite_numbers, rows
@@ -116,7 +117,7 @@ def _of_trajectory(path: Path, views: Sequence[View]) -> dict[str, FloatArray]:
 def _at_times(trajectory: Trajectory, views: Sequence[View]) -> dict[str, FloatArray]:
     found = {}
     for view in views:
-        time_ns = time_in_name(view.name)
+        time_ns = time_of(view)
         pose = None if time_ns is None else pose_at(trajectory, time_ns, MAX_GAP_S)
         if pose is not None:
             found[view.name] = pose[:, 3]

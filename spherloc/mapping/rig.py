@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.datasets.asl_layout import camera_of_folder
 from spherloc.datasets.imu import time_in_name
+from spherloc.datasets.query_gravity import time_of
 from spherloc.frontend.view import View
 from spherloc.geometry import align_to_down, camera_centre, inverse_pose, pose, rotation_angle, yaw_rotation
 from spherloc.types import BoolArray, FloatArray
@@ -49,35 +51,59 @@ Shots = Mapping[str, tuple[str, int]]
 _NUMBERS = re.compile(r"\d+(?:\.\d+)?")
 
 
+@dataclass(frozen=True)
+class Key:
+    """What orders the images of a camera, and tells which were taken together."""
+
+    number: float
+    """A time in nanoseconds, or the longest number in a name; -1 without one."""
+    is_time: bool
+
+
 def shots_of(views: Sequence[View]) -> Shots:
     """Camera and time step of the images of cameras that took most of their images together, as names and times in them
-    say; none if there are no two such cameras. A panorama sees all around and is left out."""
-    keys = {camera: images for camera, images in _keys_of(views).items() if len(images) >= MIN_TOGETHER}
-    if len(keys) < 2:
+    or tables say; none if there are no two such cameras. A panorama sees all around and is left out."""
+    return taken_together(_keys_of(views))
+
+
+def taken_together(keys: Mapping[str, Mapping[str, Key]]) -> Shots:
+    """Camera and time step of the images of those cameras that took most of their images together, by the keys of each
+    camera's images by name."""
+    numbers = {camera: images for camera, images in _numbers_of(keys).items() if len(images) >= MIN_TOGETHER}
+    if len(numbers) < 2:
         return {}
-    steps = _steps_of(keys)
+    steps = _steps_of(numbers)
     if len(steps) < MIN_TOGETHER:
         return {}
     found: dict[str, tuple[str, int]] = {}
-    for camera, together in _in_steps(keys, steps, _room(steps)).items():
+    for camera, together in _in_steps(numbers, steps, _room(steps)).items():
         count = len({step for _, step in together.values()})
-        if count >= max(MIN_TOGETHER, SHARE_TOGETHER * min(len(keys[camera]), len(steps))):
+        if count >= max(MIN_TOGETHER, SHARE_TOGETHER * min(len(numbers[camera]), len(steps))):
             found.update(together)
     return found if len({camera for camera, _ in found.values()}) > 1 else {}
 
 
-def _keys_of(views: Sequence[View]) -> dict[str, dict[str, float]]:
-    """The number or time of each image by its name, by its camera; panoramas are left out."""
-    keys: dict[str, dict[str, float]] = {}
+def _keys_of(views: Sequence[View]) -> dict[str, dict[str, Key]]:
+    """The key of each image by its name, by its camera; panoramas are left out."""
+    keys: dict[str, dict[str, Key]] = {}
     for view in views:
-        if not isinstance(view.camera, Equirectangular) and (named := camera_and_key(view.name)):
-            keys.setdefault(named[0], {})[view.name] = named[1]
+        if not isinstance(view.camera, Equirectangular):
+            camera, key = camera_and_key(view.name, time_of(view))
+            keys.setdefault(camera, {})[view.name] = key
     return keys
 
 
-def _steps_of(keys: Mapping[str, Mapping[str, float]]) -> FloatArray:
+def _numbers_of(keys: Mapping[str, Mapping[str, Key]]) -> dict[str, dict[str, float]]:
+    """The numbers or times of the images that have one."""
+    return {
+        camera: {name: key.number for name, key in images.items() if key.number >= 0.0}
+        for camera, images in keys.items()
+    }
+
+
+def _steps_of(numbers: Mapping[str, Mapping[str, float]]) -> FloatArray:
     """Numbers or times (T,) of the camera with most images, growing."""
-    return np.unique(list(max(keys.values(), key=len).values()))
+    return np.unique(list(max(numbers.values(), key=len).values()))
 
 
 def _room(steps: FloatArray) -> float:
@@ -85,29 +111,37 @@ def _room(steps: FloatArray) -> float:
     return NEAR_IN_TIME * float(np.median(np.diff(steps)))
 
 
-def _in_steps(keys: Mapping[str, Mapping[str, float]], steps: FloatArray, room: float) -> dict[str, Shots]:
+def _in_steps(numbers: Mapping[str, Mapping[str, float]], steps: FloatArray, room: float) -> dict[str, Shots]:
     """Camera and time step of each image that is near enough to one, by the camera."""
     found: dict[str, Shots] = {}
-    for camera, images in keys.items():
-        nearest = {name: int(np.argmin(np.abs(steps - key))) for name, key in images.items()}
+    for camera, images in numbers.items():
+        nearest = {name: _nearest(steps, number) for name, number in images.items()}
         found[camera] = {
             name: (camera, step) for name, step in nearest.items() if abs(steps[step] - images[name]) <= room
         }
     return found
 
 
-def camera_and_key(name: str) -> tuple[str, float] | None:
+def _nearest(steps: FloatArray, number: float) -> int:
+    """Index of the nearest of growing ``steps`` (K,), the first of two."""
+    after = min(int(np.searchsorted(steps, number)), len(steps) - 1)
+    before = max(0, after - 1)
+    return before if abs(steps[before] - number) <= abs(steps[after] - number) else after
+
+
+def camera_and_key(name: str, time_ns: int | None = None) -> tuple[str, Key]:
     """The camera that a name tells, its folder or what is left of it without its longest number, and that number or
-    the time that it is; None without a number."""
+    the time that it is, if ``time_ns`` states no other."""
     path = PurePosixPath(name)
+    time_ns = time_in_name(name) if time_ns is None else time_ns
     numbers = list(_NUMBERS.finditer(path.stem))
-    if not numbers:
-        return None
-    key = max(numbers, key=lambda number: (len(number[0]), number.start()))
-    time_ns = time_in_name(name)
+    longest = max(numbers, key=lambda number: (len(number[0]), number.start()), default=None)
     folder = "" if path.parent == PurePosixPath(".") else str(path.parent)
-    camera = folder or path.stem[: key.start()] + path.stem[key.end() :]
-    return camera, float(key[0]) if time_ns is None else float(time_ns)
+    if path.parent.name != (camera := camera_of_folder(path.parent)):
+        folder = camera
+    rest = path.stem if longest is None else path.stem[: longest.start()] + path.stem[longest.end() :]
+    number = -1.0 if longest is None else float(longest[0])
+    return folder or rest, Key(number if time_ns is None else float(time_ns), time_ns is not None)
 
 
 def went_apart(poses: Mapping[str, FloatArray], shots: Shots) -> tuple[str, str] | None:
@@ -378,14 +412,15 @@ class FixedCameras:
     def times_of(self, views: Sequence[View]) -> Shots:
         """Camera and time step of other images of these cameras."""
         cameras = {camera for pair in self.relative for camera in pair}
-        keys = {camera: images for camera, images in _keys_of(views).items() if camera in cameras}
-        if len(keys) < 2:
+        found = _numbers_of(_keys_of(views))
+        numbers = {camera: images for camera, images in found.items() if camera in cameras and images}
+        if len(numbers) < 2:
             return {}
-        own = [np.unique(list(images.values())) for images in keys.values()]
+        own = [np.unique(list(images.values())) for images in numbers.values()]
         room = min([self.room, *(_room(steps) for steps in own if len(steps) > 1)])
         steps = np.unique(np.concatenate(own))
         steps = steps[np.diff(steps, prepend=-np.inf) > room]
-        return {name: shot for shots in _in_steps(keys, steps, room).values() for name, shot in shots.items()}
+        return {name: shot for shots in _in_steps(numbers, steps, room).values() for name, shot in shots.items()}
 
     def expected(self, first: tuple[str, FloatArray], second: str) -> FloatArray | None:
         """The pose (3, 4) of the second camera where that of the first one is known, by its name and its pose (3, 4);
@@ -425,5 +460,6 @@ def rig_of(views: Sequence[View]) -> FixedCameras | None:
             lengths.append(length)
     if not relative:
         return None
-    keys = {camera: images for camera, images in _keys_of(known).items() if any(camera in pair for pair in relative)}
-    return FixedCameras(relative, OFF * float(np.median(lengths)), _room(_steps_of(keys)))
+    numbers = _numbers_of(_keys_of(known))
+    fixed = {camera: numbers[camera] for pair in relative for camera in pair}
+    return FixedCameras(relative, OFF * float(np.median(lengths)), _room(_steps_of(fixed)))

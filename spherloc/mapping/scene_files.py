@@ -3,17 +3,21 @@
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
+import numpy as np
+
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import load_camera
+from spherloc.datasets.asl_layout import camera_of_folder
+from spherloc.datasets.query_gravity import BOUND_SD
 from spherloc.datasets.scene_file import read_table
 from spherloc.errors import InputError, SpherlocError
 from spherloc.files import is_file, is_folder
-from spherloc.frontend.view import View
+from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.new_images import NewImages
 from spherloc.mapping.photographs import CalibratedLens, cameras_of
@@ -24,6 +28,8 @@ SCENE = "scene.toml"
 """Scene file of the map's own images."""
 MAP_FOLDER = "{}_map"
 """What the folder of a map is called, by that of its photographs."""
+GRAVITY = "gravity.txt"
+"""Gravity of the map's images by the IMU of a sequence that they are of."""
 LENS = "lens.toml"
 """Calibration file of a lens that the map's images told."""
 COMMENT_WIDTH = 110
@@ -46,6 +52,12 @@ class MapHead:
     """The line that says whether lengths are metres."""
     sections: tuple[str, ...]
     """The sections [gravity], [frontend] and [masks]."""
+
+    def with_gravity(self, file: str) -> "MapHead":
+        """With that gravity file, beside the scene file, and no other."""
+        lines = [line for line in self.sections if not line.startswith("file = ")]
+        lines.insert(lines.index("[gravity]") + 1, f"file = {toml_text(file)}")
+        return replace(self, sections=tuple(lines))
 
 
 def scene_text(head: MapHead, names: Sequence[str]) -> str:
@@ -138,7 +150,8 @@ def lenses_given(views: Sequence[View]) -> dict[str, CalibratedLens]:
     that have one."""
     by_folder: dict[str, dict[str, Camera]] = {}
     for view in views:
-        by_folder.setdefault(Path(view.name).parent.name, {})[repr(view.camera)] = view.camera
+        name = "" if Path(view.name).parent == Path() else camera_of_folder(view.path.parent)
+        by_folder.setdefault(name, {})[repr(view.camera)] = view.camera
     how = "Given as the calibration when the map was made."
     return {name: (next(iter(found.values())), how) for name, found in by_folder.items() if len(found) == 1}
 
@@ -156,8 +169,21 @@ def write_lenses(folder: Path, lenses: Mapping[str, CalibratedLens]) -> None:
 def write_new_scene(head: MapHead, folder: Path, new_images: NewImages, camera: Camera) -> Path:
     """Write the file of ``new_scene_text``; returns its path. Raises ``OSError``."""
     path = folder / f"{_file_name(new_images.folder)}.toml"
+    if new_images.gravity:
+        file = path.with_suffix("").with_name(f"{path.stem}_{GRAVITY}")
+        write_gravity(file, new_images.gravity)
+        head = head.with_gravity(file.name)
     path.write_text(new_scene_text(head, folder, new_images, camera), encoding="utf-8")
     return path
+
+
+def write_gravity(path: Path, found: Mapping[str, Gravity]) -> None:
+    """Write a gravity file, of vectors by the name of the image; raises ``OSError``."""
+    rows = ["# image gx gy gz sd_deg: down in the camera's frame, by the IMU"]
+    for name, one in found.items():
+        sd_deg = "" if one.bound_rad is None else f" {np.degrees(one.bound_rad) / BOUND_SD:.4g}"
+        rows.append(f'"{name}" {" ".join(f"{value:.7f}" for value in one.down)}{sd_deg}')
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
 def _file_name(new_images: Path) -> str:

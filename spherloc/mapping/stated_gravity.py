@@ -27,6 +27,9 @@ class StatedGravity:
     """Rotation (3, 3) from the IMU's frame to the camera's; None if ``file`` is a gravity file."""
     remarks: tuple[str, ...]
     """Sentences on what does not fit together."""
+    in_map_folder: bool = False
+    """Whether a gravity file of them is written for the scenes of the map, as ``file`` is the log of an IMU that
+    several cameras are fixed to."""
 
 
 def read_stated_gravity(file: Path, camera_from_imu: FloatArray | None, views: Sequence[View]) -> StatedGravity:
@@ -59,12 +62,18 @@ def read_stated_gravity(file: Path, camera_from_imu: FloatArray | None, views: S
     without = [view.name for view in views if view.name not in found]
     if not found:
         raise InputError(f"{file}: has gravity of none of the {len(views)} photographs; {rule}.")
-    if without:
-        remarks.append(
-            f"{file}: {len(without)} of {len(views)} photographs have no gravity there, the first is "
-            f"{shorten(without[0])}; their vertical lines are searched."
-        )
+    remarks += without_words(file, without, len(views))
     for name, one in found.items():
         if one.bound_rad is None:
             found[name] = replace(one, bound_rad=BOUND_RAD)
     return StatedGravity(found, file, camera_from_imu, tuple(remarks))
+
+
+def without_words(file: Path, without: Sequence[str], count: int) -> list[str]:
+    """A remark on those of ``count`` photographs, by name, of which a file has no gravity; none if there are none."""
+    if not without:
+        return []
+    return [
+        f"{file}: {len(without)} of {count} photographs have no gravity there, the first is {shorten(without[0])}; "
+        "their vertical lines are searched."
+    ]

@@ -14,6 +14,7 @@ from spherloc.mapping.advice import advice
 from spherloc.mapping.model import Reconstruction
 from spherloc.mapping.new_images import NewImages
 from spherloc.mapping.scene_files import (
+    GRAVITY,
     MODEL,
     SCENE,
     UNITS_METRES,
@@ -23,6 +24,7 @@ from spherloc.mapping.scene_files import (
     relative,
     scene_text,
     toml_text,
+    write_gravity,
     write_new_scene,
 )
 from spherloc.mapping.stated_gravity import StatedGravity
@@ -95,12 +97,17 @@ def write_map(
     try:
         (folder / MODEL).mkdir(parents=True, exist_ok=True)
         made.model.write(str(folder / MODEL))
-        scene = folder / SCENE
+        scene, own_head = folder / SCENE, head
+        if kept.gravity is not None and kept.gravity.in_map_folder:
+            write_gravity(
+                folder / GRAVITY, {name: kept.gravity.found[name] for name in names if name in kept.gravity.found}
+            )
+            own_head = head.with_gravity(GRAVITY)
         if len(names) >= MIN_WITHOUT:
-            content = scene_text(head, names)
+            content = scene_text(own_head, names)
         else:
             own = NewImages(images, tuple(view for view in views if view.name in poses))
-            content = new_scene_text(head, folder, own, views[0].camera)
+            content = new_scene_text(own_head, folder, own, views[0].camera)
         scene.write_text(content, encoding="utf-8")
         new_scene = None
         if new_images is not None:
@@ -127,7 +134,7 @@ def _gravity(level: Level, stated: StatedGravity | None, folder: Path) -> list[s
     lines = ["", "[gravity]", "map = [0.0, 0.0, -1.0]", f"bound_deg = {bound}"]
     if level.by_lines:
         lines.append('query = "lines"                # where an image shows too few, gravity is that of its reference')
-    if stated is not None:
+    if stated is not None and not stated.in_map_folder:
         file = toml_text(relative(stated.file, folder))
         lines.append(f"file = {file}" if stated.camera_from_imu is None else f"imu = {file}")
         if stated.camera_from_imu is not None:

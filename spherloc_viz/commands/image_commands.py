@@ -18,6 +18,7 @@ from spherloc_viz.commands.flags import (
     RECORDINGS,
     Flag,
     OptionalFloat,
+    OptionalNumber,
     OptionalPath,
     OptionalRotation,
     OptionalText,
@@ -242,7 +243,7 @@ def map(
     camera_name: OptionalText = None,
     panorama: bool = False,
     video: OptionalPath = None,
-    frames: int = 40,
+    frames: OptionalNumber = None,
     output: OptionalPath = None,
     camera_height: OptionalFloat = None,
     distance: Annotated[tuple[str, ...], arg(metavar="IMAGE IMAGE METRES", help_behavior_hint="")] = (),
@@ -271,16 +272,20 @@ def map(
 
     spherloc map frames --video walk.mp4
 
+    spherloc map dataset-room1_512_16 --frames 60
+
     spherloc map my_panoramas --localize new_photographs --play
 
     Args:
-        folder: Folder of the photographs, or of a folder for each camera; with --video, where its frames are put.
+        folder: Folder of the photographs, of a folder for each camera, or a sequence in the layout of EuRoC or TUM-VI
+            (mav0), whose IMU and ground truth are used; with --video, where its frames are put.
         camera: Calibration file; without it, those beside the images are taken, others of 2 to 1 are panoramas, and
             matches between the rest tell their lens.
         camera_name: Which camera of that file all images have; otherwise their name or their folder's says it.
         panorama: Images of 2 to 1 are panoramas, whatever lies beside them.
         video: Take frames from this video first, the sharpest of each stretch.
-        frames: How many frames to take.
+        frames: How many images of each camera to map, the sharpest of each stretch of the video or of the folder; 40
+            if not given, of a folder only if it has more than 500 images or a recorded sequence of more than 100.
         output: Folder of the map; FOLDER_map here if not given.
         camera_height: Metres of the cameras above the ground: gives the scale.
         distance: Two images by name and the metres between them: gives the scale.
@@ -296,8 +301,8 @@ def map(
         features: What is matched: sift, aliked with LightGlue (the extra learned), or both; without it, both if that
             extra is installed.
         localize: Folder of other images, which are localized in the map as by spherloc localize; a scene is written
-            that has them as queries. Of another camera than the map's they need its calibration beside them, unless
-            they are panoramas.
+            that has them as queries. That of the map itself is taken, too, where images of it are not mapped. Of
+            another camera than the map's they need its calibration beside them, unless they are panoramas.
         play: Open the playground on it in the end.
     """
     import numpy as np
@@ -315,12 +320,11 @@ def map(
     for flag, metres in (("--camera-height", camera_height), ("--distance", apart and apart[2])):
         if metres is not None and not 0.0 < metres < MAX_METRES:
             raise InputError(f"{flag} is {metres:g}; give a positive number of metres.")
-    if not 2 <= frames <= 500:
+    if frames is not None and not 2 <= frames <= 500:
         raise InputError(f"--frames is {frames}; give a number from 2 to 500.")
     if camera_from_imu is not None and gravity is None:
         raise InputError("--camera-from-imu goes with --gravity FILE, the log of the IMU; give that file too.")
     turn = None if camera_from_imu is None else rotation_of(np.reshape(camera_from_imu, (3, 3)).tolist(), str(gravity))
-    taken = None if video is None else (video, frames)
     masked = any(one is not None for one in (mask, nadir, seam))
     masks = Masks(mask, nadir or 0.0, seam or 0.0) if masked else None
     measured = ScaleMeasurement(camera_height, apart)
@@ -329,7 +333,7 @@ def map(
         folder,
         output,
         cameras,
-        taken,
+        video,
         measured,
         localize,
         panorama=panorama,
@@ -338,6 +342,7 @@ def map(
         positions=positions,
         gravity=None if gravity is None else (gravity, turn),
         features=features,
+        frames=frames,
     )
     code = max(0 if made.whole else 1, _localize_by_default(made.new_scenes))
     scene = next(iter(made.new_scenes), made.scene)

@@ -20,6 +20,7 @@ from typing import Any
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.datasets.asl_layout import camera_of_folder
 from spherloc.datasets.scene_file import read_table
 from spherloc.errors import InputError, SpherlocError, StoppedError, reason, shorten, show
 from spherloc.files import is_folder, is_image, names_in
@@ -31,6 +32,7 @@ from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.images import check_image, read_size
 from spherloc.mapping.advice import advice, for_a_page
+from spherloc.mapping.frames import FRAMES, FrameChoice, frames_of
 from spherloc.mapping.kept_scale import FILE as SCALE_FILE
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
 from spherloc.mapping.make import Map, MapRequest, ScaleMeasurement, make_map
@@ -42,7 +44,6 @@ from spherloc.mapping.photographs import (
     Photographs,
     calibrations_in,
     cameras_of,
-    frames_of,
     photographs,
 )
 from spherloc.mapping.positions import read_positions
@@ -55,6 +56,7 @@ from spherloc.mapping.scene_files import (
     lenses_given,
     write_lenses,
 )
+from spherloc.mapping.sequence import sequence_data
 from spherloc.mapping.stated_gravity import read_stated_gravity
 from spherloc.registry import require
 from spherloc.types import FloatArray
@@ -74,7 +76,7 @@ def make(
     folder: Path,
     output: Path | None,
     cameras: Mapping[str, Camera],
-    video: tuple[Path, int] | None,
+    video: Path | None,
     measured: ScaleMeasurement,
     new_images: Path | None,
     *,
@@ -84,14 +86,15 @@ def make(
     positions: Path | None,
     gravity: tuple[Path, FloatArray | None] | None,
     features: str | None,
+    frames: int | None,
 ) -> "Finished":
     """Make the map, and print the result; raises ``InputError``.
 
-    ``cameras`` are those of the calibration file by name, ``video`` a file and a number of frames to take from it into
-    ``folder``; with ``panorama``, images of 2 to 1 are panoramas in any case. With ``find_carried``, what moves with
-    the camera below panoramas is left out, too. ``positions`` is a file of where the images were taken,
-    ``gravity`` one of their gravity, with the rotation (3, 3) from the IMU to the camera if it is the log of an IMU,
-    and ``features`` one of ``MAP_FEATURES``, the best installed if None.
+    ``cameras`` are those of the calibration file by name; ``frames`` says how many images of ``folder`` are mapped, or
+    taken from the ``video`` into it. With ``panorama``, images of 2 to 1 are panoramas in any case. With
+    ``find_carried``, what moves with the camera below panoramas is left out, too. ``positions`` is a file of where the
+    images were taken, ``gravity`` one of their gravity, with the rotation (3, 3) from the IMU to the camera if it is
+    the log of an IMU, and ``features`` one of ``MAP_FEATURES``, the best installed if None.
     """
     end_without_a_trace()
     how = how_of(features)
@@ -99,8 +102,10 @@ def make(
     check_images_of(target, folder)
     with _stages() as tell, _compiled_for(new_images):
         if video is not None:
-            _take_frames(*video, folder, tell)
-        found = photographs(folder, cameras, masks, panorama, _lens_finder(tell, folder, target, new_images))
+            _take_frames(video, frames or FRAMES, folder, tell)
+        choice = FrameChoice(None if video is not None else frames, tell=tell)
+        finder = _lens_finder(tell, folder, target, new_images)
+        found = photographs(folder, cameras, masks, panorama, finder, choice)
         if positions is not None:
             measured = ScaleMeasurement(positions=read_positions(positions, found.views))
         elif measured == ScaleMeasurement():
@@ -108,16 +113,20 @@ def make(
             if measured != ScaleMeasurement():
                 say(f"The scale is as it was given before; to make the map without it, remove {target / SCALE_FILE}.")
         stated = None if gravity is None else read_stated_gravity(*gravity, found.views)
-        for remark in (*found.remarks, *(() if stated is None else stated.remarks)):
+        unscaled = measured == ScaleMeasurement()
+        data = sequence_data(folder, found.views, gravity=gravity is None, positions=unscaled)
+        stated = stated or data.stated
+        for remark in (*found.remarks, *(() if stated is None else stated.remarks), *data.remarks):
             say(remark)
         others = None
         if new_images is not None:
-            others, remarks = new_images_of(new_images, found, panorama)
+            others, remarks = new_images_of(new_images, found, panorama, choice, imu=gravity is None)
             for remark in remarks:
                 say(f"{new_images}: {remark}")
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
         try:
-            request = MapRequest(found.views, folder, measured, others, masks, how, find_carried, stated)
+            scaled = ScaleMeasurement(positions=data.positions) if unscaled else measured
+            request = MapRequest(found.views, folder, scaled, others, masks, how, find_carried, stated)
             made = make_map(request, target, tell)
         except KeyboardInterrupt:
             say("stopped; what is done is kept, and the same command goes on from there.")
@@ -134,6 +143,8 @@ def make(
         print(f"lens          {target / LENS}, for other images of that camera: --camera {lens}")
     if others is not None:
         print(f"new images    {_sizes(others)}")
+    elif found.others:
+        print(f"other images  {found.others:,}, of which --localize {shlex.quote(str(folder))} localizes some")
     if older := _of_the_map_before(target, made):
         print(f"out of date   {', '.join(older)}: of the map before; give their images with --localize again")
     scenes = tuple(one.written.new_scene for one in (made, *made.groups) if one.written.new_scene is not None)
@@ -161,7 +172,7 @@ def _lens_finder(tell: Tell, folder: Path, target: Path, new_images: Path | None
         from spherloc.mapping.unknown_lens import find_lens
 
         place = paths[0].parent
-        path = lens_path(target, "" if place == folder else place.name)
+        path = lens_path(target, "" if place == folder else camera_of_folder(place))
         kept = kept_lens(path)
         if kept is not None and (kept.width, kept.height) == size:
             return kept, f"The lens is that of {path}, as before; that file says where it is from, and may be removed."
@@ -355,11 +366,16 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
     with for_a_page():
         try:
             check_images_of(output, folder)
-            found = photographs(folder, {}, find_lens=_lens_finder(_progress, folder, output, None))
+            finder = _lens_finder(_progress, folder, output, None)
+            found = photographs(folder, {}, find_lens=finder, choice=FrameChoice(tell=_progress))
             measured = scale_of_words(scale)
             if measured == ScaleMeasurement():
                 measured = kept_scale(output)
-            made = make_map(MapRequest(found.views, folder, measured, how=how_of()), output, _progress)
+            unscaled = measured == ScaleMeasurement()
+            data = sequence_data(folder, found.views, positions=unscaled)
+            scaled = ScaleMeasurement(positions=data.positions) if unscaled else measured
+            request = MapRequest(found.views, folder, scaled, how=how_of(), stated=data.stated)
+            made = make_map(request, output, _progress)
             _write(report, made, found, measured, {})
         except SpherlocError as error:
             _tell({"error": str(error)})
@@ -368,7 +384,7 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
             _tell({"error": _unwritten(report, error)})
             return 1
         others = "other images  open their folder in the list: they can be localized in this map"
-        told = [*found.remarks, *summary(made, found), f"report        {report}", others]
+        told = [*found.remarks, *data.remarks, *summary(made, found), f"report        {report}", others]
     _tell({"scene": str(made.written.scene), "report": str(report), "summary": told})
     return 0
 

@@ -33,6 +33,15 @@ def filled(folder, *names):
             ["day1/left/1.png", "day1/left/2.png", "notes/a.txt", ".thumbnails/small/1.png", ".thumbnails/small/2.png"],
             "is a folder without images, but with 2 deeper in it, in ",
         ),
+        (
+            ["mav0/cam0/data/1.png", "mav0/cam0/data/2.png", "mav0/cam1/data/1.png", "mav0/imu0/data.csv", "notes.txt"],
+            "is a recorded sequence in the layout of EuRoC and TUM-VI, with 2 images of cam0 and 1 image of cam1; make "
+            "a map of some of them with: spherloc map ",
+        ),
+        (
+            ["sensor.yaml", "data/1.png"],
+            "is a recorded sequence in the layout of EuRoC and TUM-VI, with 1 image of my photos; make a map of some",
+        ),
         (["a.mp4"], "is a folder of 1 video; make a map of the frames of one with: spherloc map "),
         ([], "is an empty folder; give the path of a scene file"),
         (["notes.txt"], "is a folder without images or scene files; give the path of a scene file"),
@@ -59,6 +68,10 @@ def test_images_deeper_in_a_folder_are_found(tmp_path):
     assert images_below(tmp_path) == (day, 4)
     assert images_below(tmp_path / "a") == (tmp_path / "a" / "b" / "c", 2)
     assert images_below(tmp_path / "recordings") is None and images_below(tmp_path / "trip" / "day2") is None
+    mav = tmp_path / "recorded" / "MH_01" / "mav0"
+    filled(mav, "cam0/data/1.png", "cam0/data/2.png", "cam1/data/1.png", "imu0/data.csv")
+    assert images_below(tmp_path / "recorded") == (mav.parent, 3)
+    assert f"with 3 deeper in it, in {mav.parent}; make a map" in what_it_is(tmp_path / "recorded")
     (tmp_path / "a" / "b" / "around").symlink_to(tmp_path / "a")
     (tmp_path / "a" / "b" / "c" / "1.png").unlink()
     assert images_below(tmp_path / "a") is None, "a folder that is in itself ends, too"

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from spherloc.datasets.given_path import MAX_FOLDERS, images_in_folders
+from spherloc.datasets.asl_layout import AslSequence, asl_sequence
+from spherloc.datasets.given_path import MAX_FOLDERS, images_in_folders, images_of_cameras
 from spherloc.datasets.scene_file import read_table
 from spherloc.errors import InputError
 from spherloc.files import IMAGES
@@ -53,8 +54,10 @@ class Listing:
     photographs: int
     """Number of image files in it."""
     in_folders: dict[str, int]
-    """Number of image files in each of its sub-folders that has some; empty if it has image files itself, or if a link
-    in it leads out of the allowed folders."""
+    """Number of image files in each of its sub-folders that has some, or of each camera of a sequence in the ASL
+    layout; empty if it has image files itself, or if a link in it leads out of the allowed folders."""
+    sequence: bool = False
+    """Whether it is such a sequence."""
 
 
 class Roots:
@@ -107,8 +110,18 @@ class Roots:
         rows = tuple(describe(path, own) for path, own in entries[PAGE * page : PAGE * (page + 1)])
         above = self.place(folder.parent)
         folders = [] if photographs or outside else [path.name for path, _ in entries if path.is_dir()]
-        counts = images_in_folders(folder, folders, MAX_FOLDERS)
-        return Listing(folder, self.place(folder) or "", above, rows, page, pages, remarks, photographs, counts)
+        sequence = None if photographs or outside else self._sequence(folder)
+        counts = images_in_folders(folder, folders, MAX_FOLDERS) if sequence is None else images_of_cameras(sequence)
+        at, recorded = self.place(folder) or "", sequence is not None
+        return Listing(folder, at, above, rows, page, pages, remarks, photographs, counts, recorded)
+
+    def _sequence(self, folder: Path) -> AslSequence | None:
+        """The sequence in the ASL layout that a folder is, if all of its cameras are below the roots."""
+        sequence = asl_sequence(folder)
+        inside = sequence is not None and all(
+            self.place(Path(os.path.realpath(images))) is not None for images in sequence.cameras.values()
+        )
+        return sequence if inside else None
 
     def _entries(self, folder: Path) -> tuple[list[tuple[Path, str]], tuple[str, ...], int, int]:
         """Folders, then TOML files, by name, each with its place; what was left out; how many are images; and how many

@@ -30,6 +30,10 @@ MAP_ABOUT = (
     "and opens when it is done. For metres, give as Scale the height of the cameras above the ground (1.6), or two "
     "photographs and their distance (1.jpg 5.jpg 12.5)."
 )
+SEQUENCE_ABOUT = (
+    "Some of its images are mapped, the sharpest of each stretch, with its calibrations; gravity is from its IMU and "
+    "metres are from its ground truth where these are there. It takes some minutes, and opens when it is done."
+)
 MAX_NAMED = 3
 """Largest number of folders, besides the last, that are named."""
 RULE = "border-top:1px solid rgba(128,140,160,.22)"
@@ -71,9 +75,11 @@ def _folder_html(listing: Listing, in_map: str, made: bool) -> str:
     rows = [_row_html(above, "↑ up" if listing.parent else "↑ all folders", "")]
     if in_map and (count := listing.photographs or sum(listing.in_folders.values())):
         these, about = ("this photograph", ONE_ABOUT) if count == 1 else (f"these {count:,} photographs", NEW_ABOUT)
+        these = "images of this sequence" if listing.sequence else these
         rows.append(_row_html(f"localize-folder:{listing.place}", f"Localize {these} in {in_map}", about))
     if title := _map_title(listing):
-        title, about = (f"{title} again", AGAIN_ABOUT) if made else (title, MAP_ABOUT)
+        new_about = SEQUENCE_ABOUT if listing.sequence else MAP_ABOUT
+        title, about = (f"{title} again", AGAIN_ABOUT) if made else (title, new_about)
         rows.append(_row_html(f"map-folder:{listing.place}", title, about))
     for row in listing.rows:
         if row.kind == "folder":
@@ -101,6 +107,9 @@ def _map_title(listing: Listing) -> str:
     if inside < MIN_IMAGES:
         return ""
     *others, last = sorted(listing.in_folders)
+    if listing.sequence:
+        cameras = f"{', '.join(others)} and {last}" if others else last
+        return f"Make a map of this sequence of {cameras}, {inside:,} images"
     folders = f"the folders {', '.join(others)} and {last}" if others else f"the folder {last}"
     if len(others) > MAX_NAMED:
         folders = f"{len(others) + 1} folders"
