@@ -1,11 +1,11 @@
 """Maps of rendered panoramas whose true positions are known: a Markdown table of right and wrong images.
 
-    .venv/bin/python -m benchmarks.maps [apartment:12 campus:20 ...]     # some four minutes for the default ones
-    .venv/bin/python -m benchmarks.maps --features sift+aliked           # fifteen, with the extra ``learned``
+    .venv/bin/python -m benchmarks.maps [apartment:12 campus:20:7 ...]   # some six minutes for the default ones
+    .venv/bin/python -m benchmarks.maps --features sift+aliked           # twenty-five, with the extra ``learned``
 
-A world and a number of panoramas, evenly along its path, are one row. Each of the maps that ``spherloc map`` makes of
-them is put onto the truth by the similarity that most of its images agree with; an image that is then more than
-``WRONG_M`` off is wrong. Maps of two images are not judged. Needs the extra ``colmap``.
+A world, a number of panoramas, evenly along its path, and the world's seed (0 if none is given) are one row. Each of
+the maps that ``spherloc map`` makes of them is put onto the truth by the similarity that most of its images agree with;
+an image that is then more than ``WRONG_M`` off is wrong. Maps of two images are not judged. Needs the extra ``colmap``.
 """
 
 import argparse
@@ -25,7 +25,12 @@ from spherloc.mapping.photographs import photographs
 from spherloc.types import FloatArray
 from spherloc_viz.commands.map import how_of
 
-SETS = ("apartment:10", "apartment:12", "apartment:16", "apartment:22", "campus:12", "campus:20")
+SETS = (
+    *(f"apartment:{count}" for count in (10, 12, 16, 22)),
+    *(f"apartment:14:{seed}" for seed in (21, 22, 23, 24)),
+    "campus:12",
+    "campus:20",
+)
 WRONG_M = 0.25
 FEW = 3
 """Images that fix a similarity."""
@@ -34,6 +39,7 @@ kind = "rendered"
 name = "{world}"
 provenance = "spherloc"
 world = "{world}"
+seed = {seed}
 [camera]
 model = "equirectangular"
 width = 896
@@ -47,10 +53,10 @@ stop = 0.6
 """
 
 
-def photographed(world: str, count: int, folder: Path) -> dict[str, FloatArray]:
+def photographed(world: str, count: int, seed: int, folder: Path) -> dict[str, FloatArray]:
     """Write the panoramas into a folder; returns their true positions (3,), metres, by name."""
     path = folder.with_suffix(".toml")
-    path.write_text(SCENE.format(world=world, count=count))
+    path.write_text(SCENE.format(world=world, count=count, seed=seed))
     folder.mkdir()
     places = {}
     for view in load_scene(path).references:
@@ -77,16 +83,17 @@ def errors_m(poses: dict[str, FloatArray], places: dict[str, FloatArray]) -> Flo
     return best
 
 
-def row(world: str, count: int, features: str) -> str:
+def row(world: str, count: int, seed: int, features: str) -> str:
     """One line of the table."""
+    title = f"{world}, {count}" + (f", seed {seed}" if seed else "")
     with TemporaryDirectory() as place:
         folder = Path(place) / "panoramas"
-        places = photographed(world, count, folder)
+        places = photographed(world, count, seed, folder)
         views = photographs(folder, {}).views
         try:
             made = make_map(MapRequest(views, folder, how=how_of(features)), Path(place) / "map")
         except InputError as error:
-            return f"| {world}, {count} | none: {error} | | | |"
+            return f"| {title} | none: {error} | | | |"
         maps = [one.written.poses for one in (made, *made.groups)]
         off = [errors_m(poses, places) for poses in maps if len(poses) >= FEW]
         pairs = sum(len(poses) < FEW for poses in maps)
@@ -94,19 +101,19 @@ def row(world: str, count: int, features: str) -> str:
     wrong, right = np.count_nonzero(joined > WRONG_M), joined[joined <= WRONG_M]
     sizes = " + ".join(str(len(errors)) for errors in off) + (f" and {pairs} of two" if pairs else "")
     median = f"{100 * np.median(right):.1f}" if len(right) else "-"
-    return f"| {world}, {count} | {sizes} | {len(right)} | {wrong} | {median} |"
+    return f"| {title} | {sizes} | {len(right)} | {wrong} | {median} |"
 
 
 def main() -> None:
     """Print the table."""
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("sets", nargs="*", default=SETS, metavar="WORLD:COUNT")
+    words.add_argument("sets", nargs="*", default=SETS, metavar="WORLD:COUNT[:SEED]")
     words.add_argument("--features", default="sift")
     given = words.parse_args()
     print("| panoramas | maps of | right | wrong | median of the right ones, cm |\n|---|---|---|---|---|")
     for one in given.sets:
-        world, _, count = one.partition(":")
-        print(row(world, int(count), given.features), flush=True)
+        world, count, *seed = one.split(":")
+        print(row(world, int(count), int(seed[0]) if seed else 0, given.features), flush=True)
 
 
 if __name__ == "__main__":

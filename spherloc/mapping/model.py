@@ -197,7 +197,8 @@ def contradictions(
     best = counts.max(axis=1)
     found = []
     for row, index in enumerate(inside):
-        for rank, place in enumerate(np.argsort(apart[row])[:-1].tolist()):
+        for rank, column in enumerate(np.argsort(apart[row])[:-1]):
+            place = int(column)
             other = inside[place]
             pair, distance = (names[index], names[other]), apart[row, place]
             hardly_match = (
@@ -238,8 +239,8 @@ def _seen_alike(
         same &= np.maximum(ranges, other_ranges) <= SAME_VIEW_DEPTH * np.minimum(ranges, other_ranges)
         field = transform(poses[other], there.points)
         same &= seen[:, 2] >= np.min(field[:, 2] / np.linalg.norm(field, axis=1), initial=1.0) * other_ranges
-        alike += np.count_nonzero(same)
-        both += np.count_nonzero(same & np.isin(points[one].ids, there.ids))
+        alike += int(np.count_nonzero(same))
+        both += int(np.count_nonzero(same & np.isin(points[one].ids, there.ids)))
     return alike, both
 
 
