@@ -1,9 +1,10 @@
 """Maps of rendered panoramas whose true positions are known: a Markdown table of right and wrong images.
 
-    .venv/bin/python -m benchmarks.maps [apartment:12 campus:20:7 ...]   # some six minutes for the default ones
-    .venv/bin/python -m benchmarks.maps --features sift+aliked           # twenty-five, with the extra ``learned``
+    .venv/bin/python -m benchmarks.maps [apartment:12 campus:20:7:uneven ...]
+    .venv/bin/python -m benchmarks.maps --features sift+aliked           # with the extra ``learned``
 
-A world, a number of panoramas, evenly along its path, and the world's seed (0 if none is given) are one row. Each of
+A world, a number of panoramas, evenly along its path, and the world's seed (0 if none is given) are one row; with
+``uneven`` behind it exposure, colour, sharpness and noise differ, as in photographs that one takes in passing. Each of
 the maps that ``spherloc map`` makes of them is put onto the truth by the similarity that most of its images agree with;
 an image that is then more than ``WRONG_M`` off is wrong. Maps of two images are not judged. Needs the extra ``colmap``.
 """
@@ -22,12 +23,12 @@ from spherloc.experiments.summary import align
 from spherloc.geometry import camera_centre
 from spherloc.mapping.make import MapRequest, make_map
 from spherloc.mapping.photographs import photographs
-from spherloc.types import FloatArray
+from spherloc.types import ByteArray, FloatArray
 from spherloc_viz.commands.map import how_of
 
 SETS = (
     *(f"apartment:{count}" for count in (10, 12, 16, 22)),
-    *(f"apartment:14:{seed}" for seed in (21, 22, 23, 24)),
+    *(f"apartment:14:{seed}:uneven" for seed in (21, 22, 23, 24)),
     "campus:12",
     "campus:20",
 )
@@ -53,15 +54,26 @@ stop = 0.6
 """
 
 
-def photographed(world: str, count: int, seed: int, folder: Path) -> dict[str, FloatArray]:
+def uneven(image: ByteArray, rng: np.random.Generator) -> ByteArray:
+    """A rendered image (H, W, 3) as a photograph with its own exposure, colour, sharpness and noise."""
+    light = np.clip(image / 255.0 * rng.uniform(0.6, 1.5), 0.0, 1.0) ** rng.uniform(0.8, 1.2)
+    coloured = np.clip(255.0 * light * rng.uniform(0.92, 1.08, 3), 0.0, 255.0)
+    blurred = cv2.GaussianBlur(coloured, (0, 0), rng.uniform(0.4, 1.0))
+    noisy = np.clip(blurred + rng.normal(0.0, 2.5, image.shape), 0.0, 255.0).astype(np.uint8)
+    _, packed = cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, 70])
+    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)
+
+
+def photographed(world: str, count: int, seed: int, change: bool, folder: Path) -> dict[str, FloatArray]:
     """Write the panoramas into a folder; returns their true positions (3,), metres, by name."""
+    rng = np.random.default_rng(seed)
     path = folder.with_suffix(".toml")
     path.write_text(SCENE.format(world=world, count=count, seed=seed))
     folder.mkdir()
     places = {}
     for view in load_scene(path).references:
         name = f"{view.name}.png"
-        cv2.imwrite(str(folder / name), view.read())
+        cv2.imwrite(str(folder / name), uneven(view.read(), rng) if change else view.read())
         places[name] = camera_centre(view.cam_from_map)
     return places
 
@@ -83,12 +95,12 @@ def errors_m(poses: dict[str, FloatArray], places: dict[str, FloatArray]) -> Flo
     return best
 
 
-def row(world: str, count: int, seed: int, features: str) -> str:
+def row(world: str, count: int, seed: int, change: bool, features: str) -> str:
     """One line of the table."""
-    title = f"{world}, {count}" + (f", seed {seed}" if seed else "")
+    title = f"{world}, {count}" + (f", seed {seed}" if seed else "") + (", uneven" if change else "")
     with TemporaryDirectory() as place:
         folder = Path(place) / "panoramas"
-        places = photographed(world, count, seed, folder)
+        places = photographed(world, count, seed, change, folder)
         views = photographs(folder, {}).views
         try:
             made = make_map(MapRequest(views, folder, how=how_of(features)), Path(place) / "map")
@@ -107,13 +119,14 @@ def row(world: str, count: int, seed: int, features: str) -> str:
 def main() -> None:
     """Print the table."""
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("sets", nargs="*", default=SETS, metavar="WORLD:COUNT[:SEED]")
+    words.add_argument("sets", nargs="*", default=SETS, metavar="WORLD:COUNT[:SEED[:uneven]]")
     words.add_argument("--features", default="sift")
     given = words.parse_args()
     print("| panoramas | maps of | right | wrong | median of the right ones, cm |\n|---|---|---|---|---|")
     for one in given.sets:
-        world, count, *seed = one.split(":")
-        print(row(world, int(count), int(seed[0]) if seed else 0, given.features), flush=True)
+        world, count, *more = one.split(":")
+        seed = int(more[0]) if more else 0
+        print(row(world, int(count), seed, "uneven" in more, given.features), flush=True)
 
 
 if __name__ == "__main__":
