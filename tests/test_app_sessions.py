@@ -581,6 +581,17 @@ def test_a_page_that_is_opened_by_a_link_begins_with_it(house: House, monkeypatc
     assert solved == ["ransac-2p"] and len(house.notes.traces) == 1
 
 
+def test_pages_begin_with_what_was_localized_before(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing else is solved before."""
+    solved: list[str] = []
+    monkeypatch.setattr(session_module, "estimate", lambda *words: (solved.append(words[1]), estimate(*words))[1])
+    label = next(iter(house.services.catalog.scenes))
+    house.services.begin = RunRequest(SceneRequest(label, 3), "ransac-2p", None)
+    _, session = house.visit()
+    assert solved == ["ransac-2p"] and session._run is not None and session._run.request.scene.seed == 3
+    assert session._controls.scene._seed.value == "3" and session._controls.estimator.read()[0] == "ransac-2p"
+
+
 def test_a_page_that_waits_for_its_first_estimator_says_so_in_the_canvas(
     house: House, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,7 +15,9 @@ from pathlib import Path
 import viser
 
 from spherloc.datasets import bundled_scenes
-from spherloc.errors import InputError, RecordingError
+from spherloc.errors import InputError, RecordingError, SpherlocError
+from spherloc.experiments.kept_results import kept_results
+from spherloc.experiments.results import LOCALIZED
 from spherloc.files import is_folder
 from spherloc.warm_up import warm_up
 from spherloc_viz.app.audience import Audience
@@ -33,6 +35,7 @@ from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.viewer import ViewerRoom, of_index
 from spherloc_viz.app.web.viser_internals import role_header, set_theme, start_viser, stop_viser
 from spherloc_viz.given_files import is_recording
+from spherloc_viz.options import usable_estimators
 from spherloc_viz.plugins import extensions
 from spherloc_viz.recording.index.run_index import RunIndex
 from spherloc_viz.recording.replay import RecordedScene, recorded_options
@@ -64,7 +67,8 @@ def serve(
 ) -> None:
     """Run the playground until Ctrl-C or a termination signal.
 
-    ``scene`` is offered first, before those that come with the project; of a recording (.rrd), pages open its run.
+    ``scene`` is offered first, before those that come with the project; of a recording (.rrd), pages open its run, and
+    of a sequence that was localized before the query with most inliers.
     Port 0 takes any free port. ``on_address`` is called with the address as soon as browsers can be sent there, where
     they wait until all is ready; ``framed`` lets other pages of this machine, such as a notebook's, show the page in a
     frame. Runs that a page settles on are recorded into ``recordings`` unless ``record`` is false; beyond
@@ -86,6 +90,7 @@ def serve(
         stack.callback(compilation.close)
         compilation.start()
         services = Services(catalog, allowed_roots(scene, allow), first=first, compilation=compilation)
+        services.begin = None if scene is None else best_localized(catalog, recordings)
         sessions = Sessions(services)
         stack.callback(services.downloads.close)
         if record:
@@ -116,6 +121,24 @@ def _first_run(catalog: Catalog) -> Known | None:
     run = scene.run
     request = RunRequest(SceneRequest(label, run.seed), run.estimator, recorded_options(run, scene.path))
     return Known(request, scene.path, run.cam_from_map)
+
+
+def best_localized(catalog: Catalog, results: Path) -> RunRequest | None:
+    """The query of the catalog's first scene that has most inliers of those that were localized before, by the same
+    estimator; None if the folder ``results`` has none."""
+    label = next(iter(catalog.scenes))
+    scene = catalog.map_scene(label)
+    if scene is None:
+        return None
+    try:
+        found = kept_results(results, scene, catalog.path(label))
+    except SpherlocError:  # the scene can no longer be read, as its page will say
+        return None
+    rows = () if found is None else [row for row in found.rows if row.status == LOCALIZED]
+    if found is None or not rows or found.configuration.estimator not in usable_estimators():
+        return None
+    best = max(rows, key=lambda row: row.inliers or 0)
+    return RunRequest(SceneRequest(label, found.configuration.seed, best.query), found.configuration.estimator, None)
 
 
 def _prepare(estimators: Sequence[str]) -> None:

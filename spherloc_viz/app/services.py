@@ -7,7 +7,7 @@ from pathlib import Path
 
 from spherloc.diagnosis import Diagnosis
 from spherloc.trace import Trace
-from spherloc_viz.app.catalog import Catalog, Run
+from spherloc_viz.app.catalog import Catalog, Run, RunRequest
 from spherloc_viz.app.compilation import Compilation
 from spherloc_viz.app.page_runs import Known
 from spherloc_viz.app.review.run_library import RunLibrary
@@ -99,5 +99,7 @@ class Services:
     """What pages of an audience show."""
     first: Known | None = None
     """The recorded run that pages open with; None for the catalog's first scene."""
+    begin: RunRequest | None = None
+    """What pages ask for first without a recorded run; None for what the catalog's first scene begins with."""
     compilation: Compilation | None = None
     """Compiles the solvers that are not yet; None if all are ready."""

@@ -116,9 +116,11 @@ class Session:
         self._client.camera.on_update(lambda camera: self._viewer.after(VIEWER_STILL_S))
         for worker in (self._page, self._viewer, self._diagnoser, self._pictures, self._controls.slow, self._solver):
             worker.start()
-        first = self._services.first
+        first, begin = self._services.first, self._services.begin
         if first is not None:
             self.open_recorded(first.request, first.path, first.cam_from_map)
+        elif begin is not None and not is_linked(self._client):
+            self.open(begin)
         elif not is_linked(self._client):
             self._solver.ask()
 

@@ -32,8 +32,10 @@ from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.scene_files import MODEL, SCENE
 from spherloc.trajectory import read_tum
 from spherloc.warm_up import warm_up
+from spherloc_viz.app.catalog import Catalog
 from spherloc_viz.app.controls.query_strip import said_of
 from spherloc_viz.app.controls.sequence_panel import sequence_html
+from spherloc_viz.app.server import best_localized
 from spherloc_viz.commands.bundled import all_scenes, one_kind
 from spherloc_viz.commands.image_commands import _results_name
 from spherloc_viz.commands.localize import Solving, compare_sequences, localize_in_maps, localize_sequence
@@ -256,6 +258,25 @@ def test_what_was_localized_before_is_found(tmp_path: Path) -> None:
     assert found is not None and found.folder == folder / "all" and found.names == ("image0.png", "image2.png")
     path.write_text(path.read_text().replace("drawn walk", "another walk"))
     assert kept_results(folder, scene, path) is None
+
+
+@pytest.mark.usefixtures("drawn")
+def test_pages_begin_with_the_best_query_that_was_localized_before(tmp_path: Path) -> None:
+    """That of most inliers among the localized ones, by the estimator that found it."""
+    path, folder = write_scene(tmp_path, queries=3), tmp_path / "results"
+    catalog = Catalog(path)
+    assert best_localized(catalog, folder) is None
+    assert run(path, folder / "all") == 0
+    rows = read_results(folder / "all").rows
+    best = max(rows, key=lambda row: row.inliers or 0)
+    begin = best_localized(catalog, folder)
+    assert begin is not None and begin.estimator == read_results(folder / "all").configuration.estimator
+    assert begin.scene.query == best.query and begin.scene.scene == next(iter(catalog.scenes))
+    lines = (folder / "all" / "results.jsonl").read_text().splitlines()
+    doubted = [json.loads(line) | {"status": "doubtful"} if best.query in line else json.loads(line) for line in lines]
+    (folder / "all" / "results.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in doubted))
+    begin = best_localized(catalog, folder)
+    assert begin is not None and begin.scene.query != best.query
 
 
 def test_what_a_result_depends_on_is_noticed(tmp_path: Path) -> None:
