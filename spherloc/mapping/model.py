@@ -195,19 +195,19 @@ def contradictions(
     np.fill_diagonal(apart, np.inf)
     nearest = apart.min(axis=1)
     best = counts.max(axis=1)
+    beside = by_points & (apart <= SAME_VIEW_NEAR * np.maximum(nearest[:, None], nearest))
     found = []
     for row, index in enumerate(inside):
-        for rank, column in enumerate(np.argsort(apart[row])[:-1]):
-            place = int(column)
+        nearby = np.argsort(apart[row])[: min(NEARBY, len(inside) - 1)].tolist()
+        for place in dict.fromkeys((*nearby, *(row + np.flatnonzero(beside[row, row:])).tolist())):
             other = inside[place]
-            pair, distance = (names[index], names[other]), apart[row, place]
+            pair = names[index], names[other]
             hardly_match = (
-                rank < NEARBY
-                and distance <= NEAR * min(nearest[row], nearest[place])
+                place in nearby
+                and apart[row, place] <= NEAR * min(nearest[row], nearest[place])
                 and counts[index, other] < MIN_SUPPORT * min(best[index], best[other])
             )
-            limit = SAME_VIEW_NEAR * max(nearest[row], nearest[place])
-            side_by_side = by_points and row < place and distance <= limit
+            side_by_side = row < place and beside[row, place]
             if not hardly_match and not side_by_side:
                 continue
             here, there = centres[row], centres[place]
