@@ -149,7 +149,7 @@ def _undoubted(made: Reconstruction, names: Sequence[str], name: str, placed: _P
     """Whether its neighbours in the map match it: at a place that only looks alike, hardly any do."""
     poses = {**made.poses, name: placed.cam_from_model}
     points = {**points_of(made.model), name: SeenPoints.of(made.model, placed.points.tolist())}
-    return not any(name in pair for pair in contradictions(poses, names, made.all_matches, points, by_points=False))
+    return not any(name in pair for pair in contradictions(poses, names, made.all_matches, points))
 
 
 def with_images(made: Reconstruction, poses: Mapping[str, FloatArray]) -> Reconstruction:

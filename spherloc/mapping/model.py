@@ -16,7 +16,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.geometry import camera_centre, transform
+from spherloc.geometry import camera_centre
 from spherloc.types import FloatArray
 
 NEARBY, NEAR = 2, 3.0
@@ -28,11 +28,12 @@ SIGHT_RAD, SIGHT_POINTS, SIGHT_FACTOR = np.radians(25.0), 8, 1.2
 """An image sees past another camera if it has at least the second number of points within the first angle around the
 direction of that camera, and half of them are farther away than the camera by the third factor."""
 SAME_VIEW_RAD, SAME_VIEW_DEPTH = np.radians(15.0), 1.5
-"""Two images should see a point alike if the rays to it differ by less, and its distances by a smaller factor."""
+"""Two panoramas should see a point alike if the rays to it differ by less, and its distances by a smaller factor."""
 SAME_VIEW_POINTS, SAME_VIEW_NEAR, MIN_SEEN = 100, 1.5, 0.1
-"""Two images contradict each other, too, if they should see so many points alike and less than that share of them are
-seen in both, where they are at most that many times as far from each other as from their nearest images. A piece of
-furniture that stands at two places gives many matches, but what is around it does not match."""
+"""Two panoramas contradict each other, too, if they should see so many points alike and less than that share of them
+are seen in both, where they are at most that many times as far from each other as from their nearest images. A piece of
+furniture that stands at two places gives many matches, but what is around it does not match. Of fisheyes that look
+aside, right neighbours may see as little of each other's points."""
 EXPECTED_SEEN = 8, 20
 """So many of so many points are added to those that two images see, and should see, alike: where a map is cut, few
 points say little."""
@@ -90,7 +91,8 @@ class Reconstruction:
 
     def judged(self) -> "Reconstruction":
         """The model with its contradictions computed anew."""
-        against = contradictions(self.poses, list(self.ids), self.all_matches, points_of(self.model))
+        seen, panoramas = points_of(self.model), panoramas_of(self.model)
+        against = contradictions(self.poses, list(self.ids), self.all_matches, seen, panoramas)
         return replace(self, contradictions=against)
 
     def points(self) -> FloatArray:
@@ -115,13 +117,15 @@ def parted(made: Reconstruction) -> list[Reconstruction]:
     if not made.contradictions:
         return [made]
     place = {name: index for index, name in enumerate(made.ids)}
-    points = points_of(made.model)
+    points, panoramas = points_of(made.model), panoramas_of(made.model)
     graph = nx.Graph()
     graph.add_nodes_from(made.poses)
     for pair in combinations(made.poses, 2):
         if matches := int(made.all_matches[place[pair[0]], place[pair[1]]]):
-            alike, both = _seen_alike(made.poses, points, pair)
-            share = (both + EXPECTED_SEEN[0]) / (alike + EXPECTED_SEEN[1])
+            share = 1.0
+            if panoramas.issuperset(pair):
+                alike, both = _seen_alike(made.poses, points, pair)
+                share = (both + EXPECTED_SEEN[0]) / (alike + EXPECTED_SEEN[1])
             graph.add_edge(*pair, capacity=round(100 * matches * share))
     if (alone := _contradicted_end(graph, made.contradictions)) is not None:
         return parted(made.without({alone}).judged())
@@ -182,9 +186,9 @@ def contradictions(
     names: Sequence[str],
     counts: NDArray[np.int64],
     points: Mapping[str, SeenPoints],
-    by_points: bool = True,
+    panoramas: Collection[str] = (),
 ) -> tuple[tuple[str, str], ...]:
-    """Pairs of neighbouring images of ``poses``, in sight of each other, that hardly match or, if ``by_points``, hardly
+    """Pairs of neighbouring images of ``poses``, in sight of each other, that hardly match or, of ``panoramas``, hardly
     see each other's points.
 
     ``counts`` (V, V) are the numbers of matches of all ``names``, ``points`` what each image sees.
@@ -195,7 +199,8 @@ def contradictions(
     np.fill_diagonal(apart, np.inf)
     nearest = apart.min(axis=1)
     best = counts.max(axis=1)
-    beside = by_points & (apart <= SAME_VIEW_NEAR * np.maximum(nearest[:, None], nearest))
+    around = np.array([names[index] in panoramas for index in inside])
+    beside = around & around[:, None] & (apart <= SAME_VIEW_NEAR * np.maximum(nearest[:, None], nearest))
     found = []
     for row, index in enumerate(inside):
         nearby = np.argsort(apart[row])[: min(NEARBY, len(inside) - 1)].tolist()
@@ -219,7 +224,7 @@ def contradictions(
 
 
 def _see_others(poses: Mapping[str, FloatArray], points: Mapping[str, SeenPoints], pair: tuple[str, str]) -> bool:
-    """Whether two images see hardly any of the points of each other that they should see alike."""
+    """Whether two panoramas see hardly any of the points of each other that they should see alike."""
     alike, both = _seen_alike(poses, points, pair)
     return alike >= SAME_VIEW_POINTS and both < MIN_SEEN * alike
 
@@ -227,20 +232,16 @@ def _see_others(poses: Mapping[str, FloatArray], points: Mapping[str, SeenPoints
 def _seen_alike(
     poses: Mapping[str, FloatArray], points: Mapping[str, SeenPoints], pair: tuple[str, str]
 ) -> tuple[int, int]:
-    """How many of the points of either of two images both should see alike, and how many of these both see."""
+    """How many of the points of either of two panoramas both should see alike, and how many of these both see."""
     alike = both = 0
     for one, other in (pair, pair[::-1]):
-        there = points[other]
-        own = transform(poses[one], points[one].points)
-        seen = transform(poses[other], points[one].points)
-        ranges, other_ranges = np.linalg.norm(own, axis=1), np.linalg.norm(seen, axis=1)
-        rays = points[one].points - camera_centre(poses[one]), points[one].points - camera_centre(poses[other])
-        same = np.sum(rays[0] * rays[1], axis=1) >= np.cos(SAME_VIEW_RAD) * ranges * other_ranges
+        rays = points[one].points - camera_centre(poses[one])
+        other_rays = points[one].points - camera_centre(poses[other])
+        ranges, other_ranges = np.linalg.norm(rays, axis=1), np.linalg.norm(other_rays, axis=1)
+        same = np.sum(rays * other_rays, axis=1) >= np.cos(SAME_VIEW_RAD) * ranges * other_ranges
         same &= np.maximum(ranges, other_ranges) <= SAME_VIEW_DEPTH * np.minimum(ranges, other_ranges)
-        field = transform(poses[other], there.points)
-        same &= seen[:, 2] >= np.min(field[:, 2] / np.linalg.norm(field, axis=1), initial=1.0) * other_ranges
         alike += int(np.count_nonzero(same))
-        both += int(np.count_nonzero(same & np.isin(points[one].ids, there.ids)))
+        both += int(np.count_nonzero(same & np.isin(points[one].ids, points[other].ids)))
     return alike, both
 
 
@@ -265,6 +266,11 @@ def points_of(model: Any) -> dict[str, SeenPoints]:
         ids = [point.point3D_id for point in image.points2D if point.has_point3D()]
         found[image.name] = SeenPoints.of(model, ids)
     return found
+
+
+def panoramas_of(model: Any) -> set[str]:
+    """Names of the images of a model that see all around."""
+    return {image.name for image in registered(model) if image.camera.model.name == "EQUIRECTANGULAR"}
 
 
 def registered(model: Any) -> list[Any]:

@@ -6,8 +6,8 @@ poster or a floor that looks the same elsewhere.
 
 Where places look alike, a map may take two for one (see ``model``). A second map is made from the strong pairs alone,
 and the one with more images in all its parts, minus a penalty for contradictions, is taken. Where contradictions cut a
-map, both are made again without the pairs that had joined its parts. Where cameras took images together, maps of each
-by itself are another candidate, joined by these images (see ``rig``).
+map of panoramas, both are made again without the pairs that had joined its parts. Where cameras took images together,
+maps of each by itself are another candidate, joined by these images (see ``rig``).
 """
 
 import ctypes
@@ -158,7 +158,7 @@ def reconstruct(
             models, apart = _models_of(pycolmap, whole, number_of, (rotations, turns), counts, same_place, keep, tell)
             made.append(models)
             cut |= apart
-        if not cut:
+        if not cut or not all(isinstance(view.camera, Equirectangular) for view in views):
             break
         every = {pair: geometry for pair, geometry in every.items() if (names[pair[0]], names[pair[1]]) not in cut}
         agreed = _agreeing(every)
