@@ -254,9 +254,12 @@ class Playground:
         self.page.get_by_role("button", name=button, exact=True).click()
 
     def unfold(self, folder: str) -> None:
-        """Open a folder, and wait until it is open: what is pressed while it grows moves away under the pointer."""
-        title = self.page.locator("[class*=Paper-root] > [class*=Paper-root]")
-        title.filter(has_text=re.compile(rf"^{re.escape(folder)}$")).locator("visible=true").click()
+        """Open a folder once it stands still, and wait until it is open: what is pressed while something above it grows
+        moves away under the pointer."""
+        titles = self.page.locator("[class*=Paper-root] > [class*=Paper-root]")
+        title = titles.filter(has_text=re.compile(rf"^{re.escape(folder)}$")).locator("visible=true")
+        self.still(title.bounding_box, f"the folder {folder} stands still")
+        title.click()
         self.page.evaluate(PAINT)
         moving = (
             "() => document.getAnimations().some(one => one instanceof CSSTransition && one.playState === 'running')"

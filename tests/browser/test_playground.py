@@ -125,6 +125,7 @@ def test_gravity_can_be_off_and_scene_and_camera_be_changed(tab: Playground) -> 
     tab.unfold("More of the scene")
     tab.thumb("Gravity error (deg)").focus()
     tab.page.keyboard.press("End")
+    expect(tab.page.get_by_text("Changed from the scene: ")).to_be_visible()  # above the folder, which moves down
     tab.unfold("Refinement")
     tab.press("Previous")
     expect(tab.page.get_by_text(re.compile(r"which was trusted to 3° \(standard deviation\)"))).to_be_visible()
