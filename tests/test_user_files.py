@@ -137,10 +137,11 @@ OWN_FILES = {
     "worlds.render",
     "disk_cache",
     "datasets.scene_file",
+    "mapping.matched",
     "mapping.reconstruction",
     "mapping.later",
 }
-"""Those that open what spherloc itself wrote or brings: the fifth its own scenes, the last two their database."""
+"""Those that open what spherloc itself wrote or brings: the fifth its own scenes, the last three their database."""
 
 
 def _opens(node: ast.AST) -> str:

@@ -13,11 +13,12 @@ from spherloc.mapping.advice import advice
 from spherloc.mapping.carried import carried_nadir_deg
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.line_gravity import GravityByLines, gravity_by_lines
+from spherloc.mapping.matched import DATABASES
 from spherloc.mapping.model import Reconstruction
 from spherloc.mapping.new_images import NewImages
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.positions import Positions, gps_of_images
-from spherloc.mapping.reconstruction import DATABASES, reconstruct
+from spherloc.mapping.reconstruction import reconstruct
 from spherloc.mapping.rig import Shots, disagree, misfits, shots_of, went_apart
 from spherloc.mapping.scene_files import SCENE
 from spherloc.mapping.stated_gravity import StatedGravity

@@ -81,7 +81,7 @@ class ImagePairs:
         height = round(pi * min(focal_px(camera) for camera in cameras))
         sphere = Equirectangular(2 * height, height)
         bound_px = float(np.clip(BOUND_RAD * sphere.width / tau, *BOUND_PX))
-        self._bound_rad = bound_px * tau / sphere.width
+        self.bound_rad = bound_px * tau / sphere.width
         self._options = pycolmap.TwoViewGeometryOptions()
         self._options.min_num_inliers = MIN_MATCHES
         self._options.ransac.max_error = bound_px
@@ -90,10 +90,10 @@ class ImagePairs:
         self._panorama = pycolmap.Camera(
             model="EQUIRECTANGULAR", width=sphere.width, height=sphere.height, params=[sphere.width, sphere.height]
         )
-        self._bearings = [
+        self.bearings = [
             camera.unproject(one.pixels[index])[0] for camera, one, index in zip(cameras, features, usable, strict=True)
         ]
-        self._pixels = [sphere.project(rays)[0] for rays in self._bearings]
+        self._pixels = [sphere.project(rays)[0] for rays in self.bearings]
         self._words = [_unit(one.descriptors[index]) for one, index in zip(features, usable, strict=True)]
         self._gravity = gravity
         self._number_of = [np.full(len(found), -1) for found in features]
@@ -128,18 +128,18 @@ class ImagePairs:
         if len(pairs) < MIN_FIT:
             return None
         first, second = pair
-        rays = self._bearings[first][pairs[:, 0]], self._bearings[second][pairs[:, 1]]
-        pose = through(known, pair, middles, rays, self._bound_rad)
+        rays = self.bearings[first][pairs[:, 0]], self.bearings[second][pairs[:, 1]]
+        pose = through(known, pair, middles, rays, self.bound_rad)
         if pose is None:
             return None
         words = self._words[first], self._words[second]
-        rays = self._bearings[first], self._bearings[second]
-        more = guided_matches(rays, words, *pose, self._bound_rad)
+        rays = self.bearings[first], self.bearings[second]
+        more = guided_matches(rays, words, *pose, self.bound_rad)
         if len(more) < MIN_MATCHES:
             return None
         # On floors and wallpaper as many matches fit whatever the direction to the second camera is.
         for other in elsewhere(pose):
-            if PEAK * len(guided_matches(rays, words, pose[0], other, self._bound_rad)) > len(more):
+            if PEAK * len(guided_matches(rays, words, pose[0], other, self.bound_rad)) > len(more):
                 return None
         geometry = self._estimated(first, second, more)
         if not self._usable(geometry) or self.same_place(geometry) or not self._level(first, second, geometry):
@@ -149,8 +149,8 @@ class ImagePairs:
 
     def on_one_thing(self, first: int, second: int, pairs: NDArray[np.uint32], geometry: Any) -> bool:
         """Whether what fits of the matches (M, 2) may be a thing that stands at two places."""
-        rays = self._bearings[first][pairs[:, 0]], self._bearings[second][pairs[:, 1]]
-        fits = fitting(*rays, *relative(geometry), self._bound_rad)
+        rays = self.bearings[first][pairs[:, 0]], self.bearings[second][pairs[:, 1]]
+        fits = fitting(*rays, *relative(geometry), self.bound_rad)
         many = MANY_FIT_LEARNED if self._learned(first, second) else MANY_FIT
         return fit_on_one_thing((self._cameras[first], self._cameras[second]), rays, fits, many)
 
@@ -176,15 +176,15 @@ class ImagePairs:
     def _telling(self, first: int, second: int, rays: tuple[FloatArray, FloatArray], geometry: Any) -> BoolArray | None:
         """Mask (M,) of the bearings (M, 3) that show where the camera went, if clouds or other far things may hide it;
         None if they do not, or if all matches are theirs."""
-        turn = far_rotation(*rays, self._bound_rad)
+        turn = far_rotation(*rays, self.bound_rad)
         if turn is None:
             return None
-        far = unmoved(*rays, turn, self._bound_rad)
+        far = unmoved(*rays, turn, self.bound_rad)
         known = all(
             self._gravity[one] is not None or isinstance(self._cameras[one], Equirectangular) for one in (first, second)
         )
         low = below_sky(*rays, (self._down(first), self._down(second))) if known else np.ones(len(far), np.bool_)
-        telling = low & ~unmoved(*rays, turn, NOT_FAR * self._bound_rad)
+        telling = low & ~unmoved(*rays, turn, NOT_FAR * self.bound_rad)
         if np.count_nonzero(telling) < MIN_MATCHES:
             return None
         hidden = bool(far.mean() >= FAR)
@@ -199,12 +199,12 @@ class ImagePairs:
         """How many of the bearings (M, 3) fit."""
         rotation, direction = relative(geometry)
         if self.same_place(geometry):
-            return int(np.count_nonzero(unmoved(first, second, rotation, self._bound_rad)))
-        return int(np.count_nonzero(fitting(first, second, rotation, direction, self._bound_rad)))
+            return int(np.count_nonzero(unmoved(first, second, rotation, self.bound_rad)))
+        return int(np.count_nonzero(fitting(first, second, rotation, direction, self.bound_rad)))
 
     def _rays(self, first: int, second: int, pairs: NDArray[np.uint32]) -> tuple[FloatArray, FloatArray]:
         """Bearings of matches (M, 2) in both images, each (M, 3)."""
-        return self._bearings[first][pairs[:, 0]], self._bearings[second][pairs[:, 1]]
+        return self.bearings[first][pairs[:, 0]], self.bearings[second][pairs[:, 1]]
 
     def _poses(self, first: int, second: int, pairs: NDArray[np.uint32]) -> list[Any]:
         """Usable ``TwoViewGeometry`` of matches (M, 2), and of those of them that fit two level cameras."""
@@ -242,22 +242,22 @@ class ImagePairs:
         if self.same_place(geometry):
             return True
         pose = relative(geometry)
-        fits = fitting(first, second, *pose, self._bound_rad)
-        chance = chance_of_fit(first, second, *pose, self._bound_rad)
+        fits = fitting(first, second, *pose, self.bound_rad)
+        chance = chance_of_fit(first, second, *pose, self.bound_rad)
         return log10_nfa(len(first), int(np.count_nonzero(fits)), chance) <= MAX_LOG10_NFA
 
     def _more_than_chance(self, geometry: Any, first: FloatArray, second: FloatArray) -> bool:
         """Whether more of these bearings (M, 3) fit than wrong matches alone would: a pose that clouds have is none."""
-        expected = len(first) * chance_of_fit(first, second, *relative(geometry), self._bound_rad)
+        expected = len(first) * chance_of_fit(first, second, *relative(geometry), self.bound_rad)
         return self._support(geometry, first, second) > expected + 3.0 * np.sqrt(max(expected, 1.0))
 
     def _guided(self, first: int, second: int, geometry: Any) -> Any:
         """The geometry with the matches that are found near the epipolar planes, if they are more."""
         if self.same_place(geometry):
             return geometry
-        rays = self._bearings[first], self._bearings[second]
+        rays = self.bearings[first], self.bearings[second]
         words = self._words[first], self._words[second]
-        pairs = guided_matches(rays, words, *relative(geometry), self._bound_rad)
+        pairs = guided_matches(rays, words, *relative(geometry), self.bound_rad)
         if len(pairs) <= len(geometry.inlier_matches):
             return geometry
         other = self._estimated(first, second, pairs)

@@ -10,8 +10,9 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN, camera_centre, pose, rotation_angle, so3_exp, transform, yaw_rotation
+from spherloc.mapping.matched import _camera_in
 from spherloc.mapping.model import Reconstruction
-from spherloc.mapping.reconstruction import _camera_in, _joined
+from spherloc.mapping.reconstruction import _joined
 from spherloc.mapping.rig import (
     disagree,
     expected_poses,
