@@ -24,7 +24,7 @@ from spherloc.mapping.pair_evidence import Evidence, VerifiedPair
 from spherloc.mapping.parallel import Tell
 from spherloc.types import FloatArray
 
-MIN_RADIUS_DEG, MOST = 76.0, 0.5
+MIN_RADIUS_DEG, MOST = 76.0, 0.6
 """Two maps are not joined if what fits between them is within a smaller part of the view (``Between.radius_deg``), as
 of one thing that stands at two places, unless it is the second share of the matches of the pair that joins them."""
 MAX_WORK = 1000

@@ -46,7 +46,7 @@ class VerifiedPair:
     def turned_round(self) -> "VerifiedPair":
         """The same with the second image as the first."""
         rotation = self.rotation.T
-        return VerifiedPair(self.names[::-1], rotation, -rotation @ self.direction, self.matches[:, ::-1])
+        return VerifiedPair((self.names[1], self.names[0]), rotation, -rotation @ self.direction, self.matches[:, ::-1])
 
 
 class Evidence:

@@ -82,6 +82,7 @@ class ImagePairs:
         sphere = Equirectangular(2 * height, height)
         bound_px = float(np.clip(BOUND_RAD * sphere.width / tau, *BOUND_PX))
         self.bound_rad = bound_px * tau / sphere.width
+        """Largest angle of a match to its epipolar plane."""
         self._options = pycolmap.TwoViewGeometryOptions()
         self._options.min_num_inliers = MIN_MATCHES
         self._options.ransac.max_error = bound_px
@@ -93,6 +94,7 @@ class ImagePairs:
         self.bearings = [
             camera.unproject(one.pixels[index])[0] for camera, one, index in zip(cameras, features, usable, strict=True)
         ]
+        """(K, 3) of each image's usable features."""
         self._pixels = [sphere.project(rays)[0] for rays in self.bearings]
         self._words = [_unit(one.descriptors[index]) for one, index in zip(features, usable, strict=True)]
         self._gravity = gravity
