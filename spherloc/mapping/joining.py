@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from spherloc.mapping.later import with_images
 from spherloc.mapping.matched import Matched, Names
 from spherloc.mapping.model import Reconstruction, SeenPoints, contradictions, points_of
-from spherloc.mapping.pair_evidence import Evidence, VerifiedPair
+from spherloc.mapping.pair_evidence import PairEvidence, VerifiedPair
 from spherloc.mapping.parallel import Tell
 from spherloc.types import FloatArray
 
@@ -36,13 +36,13 @@ def joined_by_pairs(models: Sequence[Reconstruction], matched: Matched, tell: Te
     placed = {name for one in models for name in one.poses}
     if len(models) == 1 and len(placed) == len(matched.ids):
         return tuple(models)
-    found = _best(_Search(models, matched.ids.keys() - placed, Evidence(matched), tell))
+    found = _best(_JoinSearch(models, matched.ids.keys() - placed, PairEvidence(matched), tell))
     counts = models[0].all_matches
     made = [replace(one, all_matches=np.maximum(one.all_matches, counts)) for one in found.models]
     return tuple(sorted(made, key=lambda one: -len(one.poses)))
 
 
-def _best(search: "_Search") -> "_Result":
+def _best(search: "_JoinSearch") -> "_Result":
     """The best result with all pairs, or without some of those that join models."""
     best, tried = search.run(frozenset()), set[frozenset[Names]]()
     while True:
@@ -70,9 +70,9 @@ class _Result:
         return sum(len(one.poses) ** 2 for one in self.models), sum(int(one.all_matches.sum()) for one in self.models)
 
 
-class _Search:
+class _JoinSearch:
     def __init__(
-        self, models: Sequence[Reconstruction], alone: Collection[str], evidence: Evidence, tell: Tell
+        self, models: Sequence[Reconstruction], alone: Collection[str], evidence: PairEvidence, tell: Tell
     ) -> None:
         self._evidence, self._tell, self._work = evidence, tell, 0
         self._models, self._alone = [self._judged(one) for one in models], frozenset(alone)

@@ -49,7 +49,7 @@ class VerifiedPair:
         return VerifiedPair((self.names[1], self.names[0]), rotation, -rotation @ self.direction, self.matches[:, ::-1])
 
 
-class Evidence:
+class PairEvidence:
     """What speaks for or against that two maps are joined: the matches between their images, right or wrong."""
 
     def __init__(self, matched: Matched) -> None:
