@@ -78,7 +78,8 @@ class MapScene:
     cloud: FloatArray | None = None
     """Points (P, 3) of a map without a mesh, map frame, metres, for the canvas."""
     truth_source: str = ""
-    """What the true poses come from, if it knew more than a query's image is to tell; empty for a measurement."""
+    """What the true poses come from, if it knew more than a query's image is to tell or was aligned with the map; empty
+    for a measurement in the map's frame."""
     remarks: tuple[str, ...] = ()
     """What the loader skipped and why, in sentences."""
     matched_files: tuple[Path, ...] = ()
@@ -112,6 +113,16 @@ class MapScene:
         return self._by_name[name]
 
     def prepare(self, report: Report) -> None:
+    @property
+    def problem_remarks(self) -> tuple[str, ...]:
+        """The remarks that every problem of the scene has: ``remarks``, and where its true poses are from."""
+        return (*self.remarks, self.about_truth) if self.truth_source else self.remarks
+
+    @property
+    def about_truth(self) -> str:
+        """Where the true poses are from, as a sentence; empty for a measurement."""
+        return f"The true poses are those of {self.truth_source}." if self.truth_source else ""
+
         """Do what is needed once for all queries, so that it can be watched: describing a large map takes a while."""
         if isinstance(self.matcher, NeedsPreparing):
             self.matcher.prepare(report)
@@ -163,7 +174,7 @@ class MapScene:
             reference_index=matches.reference_index,
             reference_pixels=matches.reference_pixels,
             estimated_outlier_rate=matches.estimated_outlier_rate,
-            remarks=(*self.remarks, *matches.remarks, *said),
+            remarks=(*self.problem_remarks, *matches.remarks, *said),
             verified_without_point=matches.verified_without_point,
         )
         if view.cam_from_map is None:

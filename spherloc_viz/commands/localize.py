@@ -176,8 +176,6 @@ def localized(
     hows = [_how(scene, item, seed) for item in solvings]
     for remark in scene.remarks:
         say(remark)
-    if scene.truth_source:
-        say(f"the true poses are those of {scene.truth_source}.")
     with ExitStack() as stack:
         logs: list[ResultsLog] = []
         settings = [

@@ -146,7 +146,7 @@ def _problem(path: Path, scene: Scene, seed: int | None, query: str | None, vari
             return variation.problem(scene, seed, query)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    for remark in changed.remarks:
+    for remark in changed.problem_remarks:
         say(remark)
     view = changed.query(query)
     say(f"{path}: reading and matching images; what is new to this machine takes a while")
@@ -155,7 +155,7 @@ def _problem(path: Path, scene: Scene, seed: int | None, query: str | None, vari
     for remark in matches.remarks:
         say(remark)
     problem = changed.problem_of(view, matches)
-    for remark in problem.remarks[len(changed.remarks) + len(matches.remarks) :]:
+    for remark in problem.remarks[len(changed.problem_remarks) + len(matches.remarks) :]:
         say(remark)
     return variation.edit(problem, used_seed(scene, seed))
 

@@ -64,6 +64,18 @@ def test_a_folder_of_queries_in_the_order_of_names(tmp_path):
     assert scene.queries[0].gravity is None and scene.gravity_bound_rad == pytest.approx(np.radians(3))
 
 
+def test_what_true_poses_are_from_is_told_with_every_problem(tmp_path):
+    truth = f'[truth]\n"b.png" = {POSE}\n'
+    head = 'images = "queries"\ntruth_source = "mocap0/data.csv, which was aligned with the map"'
+    scene = load_scene(make_tree(tmp_path, CAMERA + POSED + truth, head=head))
+    assert scene.about_truth == "The true poses are those of mocap0/data.csv, which was aligned with the map."
+    assert scene.remarks == scene.problem_remarks[:-1] and scene.problem_remarks[-1] == scene.about_truth
+    measured = load_scene(make_tree(tmp_path, CAMERA + POSED + truth))
+    assert not measured.about_truth and measured.problem_remarks == measured.remarks
+    with pytest.raises(InputError, match="truth_source"):
+        load_scene(make_tree(tmp_path, CAMERA + POSED, head='images = "queries"\ntruth_source = 3'))
+
+
 def test_a_list_of_queries_and_their_own_gravity(tmp_path):
     gravity = "[gravity]\nmap = [0, 0, -1]\ncamera = [0, 2, 0]\n"
     scene = load_scene(make_tree(tmp_path, CAMERA + POSED + gravity, head='images = ["queries/b.png"]'))
