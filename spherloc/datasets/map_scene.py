@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from spherloc.cameras.principal_point import about_principal_point
 from spherloc.datasets import scene_file
 from spherloc.datasets.query_gravity import BOUND_SD, GravitySettings, MeasuredGravity, read_gravity
 from spherloc.datasets.registration import Registration
@@ -112,7 +113,6 @@ class MapScene:
             raise InputError(f"{self.where}: no query image {show(name)}; there are {some}{more}.")
         return self._by_name[name]
 
-    def prepare(self, report: Report) -> None:
     @property
     def problem_remarks(self) -> tuple[str, ...]:
         """The remarks that every problem of the scene has: ``remarks``, and where its true poses are from."""
@@ -123,6 +123,7 @@ class MapScene:
         """Where the true poses are from, as a sentence; empty for a measurement."""
         return f"The true poses are those of {self.truth_source}." if self.truth_source else ""
 
+    def prepare(self, report: Report) -> None:
         """Do what is needed once for all queries, so that it can be watched: describing a large map takes a while."""
         if isinstance(self.matcher, NeedsPreparing):
             self.matcher.prepare(report)
@@ -229,6 +230,16 @@ def _contradiction(stated: Gravity, nearby: Gravity | None) -> tuple[str, ...]:
     )
 
 
+def _about_cameras(views: Iterable[View]) -> list[str]:
+    """A remark on the first camera whose principal point seems to be wrong, and on how many others are like it."""
+    cameras = {view.camera: view.name for view in reversed(tuple(views))}
+    found = [
+        about for camera, name in cameras.items() if (about := about_principal_point(f"the camera of {name}", camera))
+    ]
+    more = [f"So it seems to be in {len(found) - 1} more of the {len(cameras)} cameras."] if len(found) > 1 else []
+    return found[-1:] + more
+
+
 REQUIRED = {"kind", "name"}
 OPTIONAL = {"about", "frontend", "gravity", "masks", "options", "thresholds", "units"}
 OPTIONAL_EXAMPLE = """\
@@ -282,7 +293,7 @@ class MapSettings:
         wrong [frontend] and if there is no query or no reference.
         """
         given, asked = tuple(references), tuple(queries)
-        remarks = list(remarks)
+        remarks = [*remarks, *_about_cameras((*asked, *given))]
         if self.masks is not None:
             given, asked = self._masked(path, given, asked, remarks)
         gravity = self.gravity

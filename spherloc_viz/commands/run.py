@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spherloc.datasets import Scene, load_scene
+from spherloc.datasets.correspondences import CorrespondencesScene
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.variation import Variation, used_seed
 from spherloc.diagnosis import Diagnosis, diagnose
@@ -143,6 +144,8 @@ def _problem(path: Path, scene: Scene, seed: int | None, query: str | None, vari
     try:
         changed = variation.scene(scene)
         if not isinstance(changed, MapScene):
+            for remark in changed.measured.remarks if isinstance(changed, CorrespondencesScene) else ():
+                say(remark)
             return variation.problem(scene, seed, query)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
