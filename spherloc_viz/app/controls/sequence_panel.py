@@ -16,7 +16,9 @@ from spherloc.experiments.sequence import How, localize
 from spherloc.experiments.summary import success_rates
 from spherloc.mapping.joint_outcome import judged_together
 from spherloc.trace import Trace
+from spherloc.types import FloatArray
 from spherloc_viz.app.controls.query_strip import QueryStrip
+from spherloc_viz.app.said_together import SaidTogether, said_together
 from spherloc_viz.app.text import ramp_html, status_html, table_html
 from spherloc_viz.app.web.touch import Touches
 from spherloc_viz.layers.primitives import Table
@@ -110,6 +112,13 @@ class SequencePanel:
         """Results by now, in the order of the sequence."""
         with self._lock:
             return self._rows.get(label, ())
+
+    def said_of(self, label: str, scene: MapScene, query: str | None, pose: FloatArray | None) -> SaidTogether | None:
+        """What the results of a scene's queries say of one whose run by itself has this ``pose`` (3, 4), by default of
+        the first one; None if nothing."""
+        name = scene.query(query).name
+        row = next((row for row in self.rows(label) if row.query == name), None)
+        return None if row is None else said_together(row, pose, scene.thresholds[0])
 
     def close(self) -> None:
         """End after the query at hand; does not wait."""
