@@ -38,6 +38,11 @@ def map_images(scene: Path) -> Path | None:
     return None if own is None or not is_folder(scene.parent / MODEL) else scene.parent / own["images"]
 
 
+def map_size(scene: Path) -> int:
+    """Number of images of the map with that scene file; raises ``InputError`` if its model cannot be read."""
+    return len(read_model(scene.parent / MODEL).images)
+
+
 def _map_of(table: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """The keys ``model`` and ``images`` of a map in its scene file; None where they are not those of ``written``."""
     own = table if table.get("kind") == "colmap" else table.get("map")
@@ -60,15 +65,15 @@ def add_new_images(scene: Path, folder: Path) -> tuple[Path, tuple[str, ...]]:
     model = read_model(scene.parent / MODEL)
     mapped = _mapped(model, images)
     new_images, remarks = new_images_of(folder, mapped)
+    truth = None
+    if new_images.truth is not None:
+        truth = aligned_truth(new_images.truth, {one.name: one.cam_from_map for one in model.images.values()})
+        remarks = (*remarks, truth_words(truth))
     gravity_of_map = table.get("gravity")
     if isinstance(gravity_of_map, dict) and gravity_of_map.get("file") == GRAVITY:
         table = table | {"gravity": {key: value for key, value in gravity_of_map.items() if key != "file"}}
     head = MapHead(
         name=_name(table),
-    truth = None
-    if new_images.truth is not None:
-        truth = aligned_truth(new_images.truth, {one.name: one.cam_from_map for one in model.images.values()})
-        remarks = (*remarks, truth_words(truth))
         about=str(table.get("about", "")),
         images=own["images"],
         units=UNITS_UNKNOWN if table.get("units") == "unknown" else UNITS_METRES,
