@@ -8,7 +8,7 @@ from spherloc.experiments.results import DOUBTFUL, FAILED, LOCALIZED, QueryResul
 from spherloc.geometry import pose, yaw_rotation
 from spherloc.mapping.joint_outcome import TRIED
 from spherloc_viz.app.said_together import SaidTogether, said_together
-from spherloc_viz.app.text import Beside, summary_html
+from spherloc_viz.app.text import ToldBeside, summary_html
 from tests.tiny_scene import write_tiny_scene
 
 HERE = pose(np.eye(3), np.array([1.0, 2.0, 3.0]))
@@ -44,7 +44,7 @@ def test_a_query_that_another_one_helped_to_localize_is_told_as_such():
 
 def test_the_summary_of_a_run_tells_it_with_the_reason(tmp_path):
     trace = estimate(load_scene(write_tiny_scene(tmp_path)).problem(), "ransac-2p", {}, 0)
-    html = summary_html(trace, Beside(together=SaidTogether(DOUBTFUL, WHY)))
+    html = summary_html(trace, ToldBeside(together=SaidTogether(DOUBTFUL, WHY)))
     assert "Success</b> by itself, <b" in html and ">doubtful</b> in the results of all queries · " in html
     assert "left/&lt;2&gt;.png, it should be 3.2 m" in html and "<2>" not in html
     assert "by itself" not in summary_html(trace)

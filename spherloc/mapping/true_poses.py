@@ -64,7 +64,7 @@ def ground_truth(folder: Path, queries: Sequence[View], mapped: Sequence[View]) 
         return None
     shots = shots_of_sequence(sequence, mapped)
     if not shots:
-        return GroundTruth(why_none="its ground truth may have another frame than that of the map's sequence")
+        return GroundTruth(why_none="the ground truth of this sequence may have another frame than that of the map's")
     asked = shots_of_sequence(sequence, queries)
     for truth in truths:
         of_map, of_queries = (
@@ -107,8 +107,8 @@ def aligned_truth(truth: GroundTruth, poses: Mapping[str, FloatArray]) -> Aligne
     count = int(np.count_nonzero(near))
     measured = f"{count} of {len(names)} images of the map fit it, to {off_m:.2g} m and {off_deg:.2g}° in the median"
     if off_m > MAX_OFF_M or off_deg > MAX_OFF_DEG or 2 * count < len(names):
-        much = f"{MAX_OFF_M:g} m and {MAX_OFF_DEG:g}° of at least half of them are the limits"
-        return AlignedTruth({}, f"{truth.source} fits the map badly: {measured}; {much}")
+        needed = f"at least half of them must, to {MAX_OFF_M:g} m and {MAX_OFF_DEG:g}°"
+        return AlignedTruth({}, f"{truth.source} fits the map badly: {measured}; {needed}")
     found = {}
     for name, truth_from_camera in truth.of_queries.items():
         centre = rotation.T @ (truth_from_camera[:, 3] - translation) / fit.scale

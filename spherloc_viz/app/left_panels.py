@@ -20,7 +20,7 @@ from spherloc_viz.app.plots.graph_view import GraphView
 from spherloc_viz.app.plots.residual_view import ResidualView
 from spherloc_viz.app.plots.yaw_view import YawView
 from spherloc_viz.app.text import (
-    Beside,
+    ToldBeside,
     legend_html,
     opening_card_html,
     opening_html,
@@ -101,7 +101,7 @@ class LeftPanels:
         selected: tuple[int, ...],
         hidden: bool,
         offered: str = "",
-        beside: Beside = Beside(),  # noqa: B008 -- frozen
+        beside: ToldBeside = ToldBeside(),  # noqa: B008 -- frozen
     ) -> None:
         """Show a step of a run, in the views that are to be seen. ``selected`` are numbers in the problem; ``hidden``
         says that what came out is not to be told: then run and picture are without it. ``offered`` is HTML that says

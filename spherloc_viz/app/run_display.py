@@ -26,7 +26,15 @@ from spherloc_viz.app.plots.graph_view import CLIQUE_STEP
 from spherloc_viz.app.said_together import SaidTogether
 from spherloc_viz.app.stage.canvas import Canvas, panel_widths_px, text_scale
 from spherloc_viz.app.stage.subjects import walk_at_end
-from spherloc_viz.app.text import Beside, cause_html, evidence_html, hidden_html, key_step_html, status_html, summary_of
+from spherloc_viz.app.text import (
+    ToldBeside,
+    cause_html,
+    evidence_html,
+    hidden_html,
+    key_step_html,
+    status_html,
+    summary_of,
+)
 from spherloc_viz.app.web.touch import Touch, Touches, pixels_of
 from spherloc_viz.app.web.viser_internals import changes_of, sent_at_once, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
@@ -235,7 +243,7 @@ class RunDisplay:
             where = self._where(run) if last and not hidden else ""
             cause = str(diagnosis.cause) if diagnosis is not None and diagnosis.doubtful else ""
             together = None if hidden else controls.said_together(known)
-            words = Beside(cause, where, together)
+            words = ToldBeside(cause, where, together)
             self.panels.draw(run, plain, pause is not None, outcome, selected, not told, offered, words)
             self.panels.diagnose(*("", "") if hidden else _diagnosed_html(trace, diagnosis, index))
             right = partial(self.canvas.card_is_right, drawn)

@@ -179,7 +179,7 @@ def summary_of(trace: Trace) -> tuple[str, list[str]]:
 
 
 @dataclass(frozen=True)
-class Beside:
+class ToldBeside:
     """What is told of a run beside its own verdict."""
 
     cause: str = ""
@@ -190,7 +190,7 @@ class Beside:
     """What other queries say of it."""
 
 
-def summary_html(trace: Trace, beside: Beside = Beside()) -> str:
+def summary_html(trace: Trace, beside: ToldBeside = ToldBeside()) -> str:
     """A run in one line, and sentences on where its query was taken and what other queries say of it."""
     cause, together = beside.cause, beside.together
     words, facts = summary_of(trace)

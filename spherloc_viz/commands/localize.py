@@ -127,6 +127,8 @@ def compare_sequences(
     code, found = 0, []
     for path, several in solvings.items():
         done = localized(path, several, seed, queries, retry_failed)
+        if done.scene.about_truth:
+            say(f"{path}: {done.scene.about_truth}")
         labels = [solving.label for solving in several]
         found += [
             Compared(label, item, summarize(item), done.backdrop)

@@ -28,6 +28,7 @@ from spherloc.errors import SpherlocError
 from spherloc.experiments import read_results
 from spherloc.experiments.kept_results import kept_results
 from spherloc.experiments.sequence import inputs_of, localize
+from spherloc.experiments.summary import summarize
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.scene_files import MODEL, SCENE
 from spherloc.trajectory import read_tum
@@ -40,6 +41,7 @@ from spherloc_viz.commands.bundled import all_scenes, one_kind
 from spherloc_viz.commands.image_commands import _results_name
 from spherloc_viz.commands.localize import Solving, compare_sequences, localize_in_maps, localize_sequence
 from spherloc_viz.commands.run import Records
+from spherloc_viz.commands.sequence_text import sequence_text
 from spherloc_viz.plots.trajectories import backdrop_of, trajectory_png
 from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.index.query import RunQuery
@@ -445,6 +447,10 @@ def test_what_other_queries_say_is_written_and_told(
     assert said_of("image1.png", results.rows[1], "m").endswith(why) and not results.rows[0].doubts
     loaded = load_scene(scene)
     assert isinstance(loaded, MapScene) and f"image1.png is doubtful: {why}" in sequence_html(results.rows, loaded)
+    aligned = replace(loaded, truth_source="mocap0, aligned with the map")
+    assert "The true poses are those of mocap0, aligned with the map." in sequence_html(results.rows, aligned)
+    assert "  the true poses are those of mocap0, al" in sequence_text(results, summarize(results), aligned)
+    assert "true poses" not in sequence_text(results, summarize(results), loaded)
     assert compare_sequences({scene: [Solving("mc", (), tmp_path / "mc", None)]}, 0, (), False, tmp_path) == 0
 
 

@@ -174,8 +174,8 @@ class SequencePanel:
 
 
 def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
-    """How far the sequence is, how many succeed within each limit, what the colours of the dots mean, and why queries
-    are doubted that are localized by themselves."""
+    """How far the sequence is, how many succeed within each limit, what the colours of the dots mean, what the truth is
+    from, and why queries are doubted that are localized by themselves."""
     rates, unit = success_rates(rows, scene.thresholds), "m" if scene.metric else "units"
     lines = [
         (f"within {rate.degrees:g}° and {rate.metres:g} {unit}", f"{rate.successes} of {rate.judged}") for rate in rates
@@ -188,8 +188,9 @@ def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
     worst = f"{scale * error_scale(np.array(errors), limit_m):.2g} {small}; red beyond {limit_m:g} {unit}"
     doubts = [f"{row.query} is doubtful: {why}" for row in rows for why in row.doubts]
     more = [f"And {len(doubts) - MAX_DOUBTS} more are."] if len(doubts) > MAX_DOUBTS else []
+    truth = [scene.about_truth] if rates and scene.about_truth else []
     return (
         table_html(Table("sequence", ("", ""), (done, located, *lines)))
         + (ramp_html("0", worst) if errors else "")
-        + "".join(status_html(sentence) for sentence in (*doubts[:MAX_DOUBTS], *more))
+        + "".join(status_html(sentence) for sentence in (*truth, *doubts[:MAX_DOUBTS], *more))
     )
