@@ -5,11 +5,13 @@
 Two fisheyes that sway as a walker's are drawn along a part of the campus, four times a second. Between these images lie
 blurred copies at 20 Hz, so that those that are drawn are the sharpest of their stretches. The IMU has 200 Hz and noise,
 the body's frame is that of neither sensor, and the ground truth has another origin and other axes. Positions are
-compared with the truth after the similarity that most images agree with. Needs the extra ``colmap``.
+compared with the truth after the similarity that most images agree with, and so are the true poses that other images of
+the sequence get by its ground truth. Needs the extra ``colmap``.
 """
 
 import argparse
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -18,12 +20,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from spherloc.cameras.kannala_brandt import KannalaBrandt
-from spherloc.geometry import camera_centre
+from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.mapping.frames import FrameChoice
 from spherloc.mapping.make import MapRequest, ScaleMeasurement, make_map
+from spherloc.mapping.new_images import new_images_of
 from spherloc.mapping.photographs import photographs
-from spherloc.mapping.positions import overlaid
+from spherloc.mapping.positions import SimilarityFit, overlaid
 from spherloc.mapping.sequence import sequence_data
+from spherloc.mapping.true_poses import truth_words
 from spherloc.types import FloatArray
 from spherloc.worlds import Conditions, build_world, render
 
@@ -127,7 +131,9 @@ def main() -> None:
         data = sequence_data(folder, found.views)
         print("\n".join([*found.remarks, *data.remarks]))
         measured = ScaleMeasurement(positions=data.positions)
-        made = make_map(MapRequest(found.views, folder, measured, stated=data.stated), Path(place) / "map")
+        others, _ = new_images_of(folder, found, choice=FrameChoice(frames))
+        request = MapRequest(found.views, folder, measured, others, stated=data.stated)
+        made = make_map(request, Path(place) / "map")
         seconds = time.perf_counter() - start
     mapped = made.written.poses
     fit = overlaid(*(np.array([camera_centre(one[name]) for name in mapped]) for one in (mapped, truth)))
@@ -137,6 +143,27 @@ def main() -> None:
         f"{len(mapped)} of {len(found.views)} images, {far} of them over {FAR_M} m off; "
         f"positions {100 * np.median(fit.off_m):.1f} cm (median), down {np.median(leans):.2f}°, "
         f"scale {100 * (1.0 / fit.scale - 1.0):+.2f} %, {seconds:.0f} s"
+    )
+    if made.written.truth is not None:
+        print(truth_words(made.written.truth))
+        print(true_poses_off(made.written.truth.poses, truth, fit))
+
+
+def true_poses_off(found: Mapping[str, FloatArray], truth: Mapping[str, FloatArray], fit: SimilarityFit) -> str:
+    """How far true poses in the map's frame are from those of the renderer, after the similarity from the map to its
+    world."""
+    if not found:
+        return "no other image has a true pose"
+    centres = np.array([camera_centre(pose) for pose in found.values()])
+    off_m = np.linalg.norm(
+        fit.scale * centres @ fit.rotation.T + fit.translation - [camera_centre(truth[name]) for name in found], axis=1
+    )
+    off_deg = [
+        np.degrees(rotation_angle(pose[:, :3] @ fit.rotation.T @ truth[name][:, :3].T)) for name, pose in found.items()
+    ]
+    return (
+        f"true poses of {len(found)} other images: {100 * np.median(off_m):.2f} cm and {np.median(off_deg):.2f}° off "
+        f"(median), {100 * off_m.max():.2f} cm and {max(off_deg):.2f}° at most"
     )
 
 

@@ -111,6 +111,8 @@ def test_where_a_query_was_taken_is_told_by_the_nearest_references() -> None:
         f"Taken {length_text(apart_m[0])} from {names[0]} and {length_text(apart_m[1])} from {names[1]}."
     )
     assert "Its truth is the pose that the map's files give it" in said
+    aligned = replace(scene, truth_source="mocap0/data.csv, which was aligned with the map: 9 images fit it")
+    assert where_taken(aligned, at).endswith("Its truth is that of mocap0/data.csv, which was aligned with the map.")
     blind = replace(at, problem=replace(problem, truth_cam_from_map=None, truth_inliers=None))
     assert where_taken(scene, blind) == said.partition(" Its truth")[0]
     assert where_taken(scene, replace(at, cam_from_map=None)) == ""

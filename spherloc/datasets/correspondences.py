@@ -10,6 +10,7 @@ import numpy as np
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_from_table
+from spherloc.cameras.principal_point import about_principal_point
 from spherloc.datasets import scene_file
 from spherloc.errors import InputError, ProblemError, reason, show
 from spherloc.files import is_file, read_file, reading
@@ -87,10 +88,12 @@ def load(table: dict[str, Any], path: Path) -> CorrespondencesScene:
     scene_file.check_keys(truth, {"cam_from_map"} if truth else set(), set(), f"{where} [truth]")
     rows, inliers = read_csv(path.parent / scene_file.text(table, "correspondences", where))
     name = scene_file.text(table, "name", where)
+    camera = camera_from_table(scene_file.section(table, "camera", where), where)
+    doubt = about_principal_point("the camera", camera)
     try:
         problem = Problem(
             name=name,
-            camera=camera_from_table(scene_file.section(table, "camera", where), where),
+            camera=camera,
             pixels=rows[:, :2],
             points=rows[:, 2:],
             gravity_camera=scene_file.numbers(gravity["camera"], (3,), "camera", f"{where} [gravity]"),
@@ -104,6 +107,7 @@ def load(table: dict[str, Any], path: Path) -> CorrespondencesScene:
             truth_inliers=inliers,
             image=_image(table, path),
             scene=where,
+            remarks=(doubt,) if doubt else (),
         )
     except ProblemError as error:
         raise InputError(f"{where}: {error}") from None

@@ -197,6 +197,7 @@ calibration = "camera.yaml"     # of the queries: any file that spherloc reads; 
 # images = "left*"              # a pattern of names, or a list of names
 # calibration = "left.yaml"     # or camera = {...}
 
+# truth_source = "mocap.csv, aligned with the map"  # where true poses in [truth] are from, told beside errors
 # units = "unknown"             # of a model without a scale in [map]; "metres" if it is to scale
 
 [map]                           # the references are a COLMAP model ...
@@ -228,7 +229,7 @@ bound_deg = 3.0
 GRAVITY_BOUND_DEG = 3.0
 """Default bound on a query's gravity, taken from its most similar reference; 0 where the scene states it."""
 
-_OPTIONAL = _CAMERA_KEYS | {"cameras", "map", "queries", "references", "truth"}
+_OPTIONAL = _CAMERA_KEYS | {"cameras", "map", "queries", "references", "truth", "truth_source"}
 
 
 @dataclass(frozen=True)
@@ -267,7 +268,17 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     down, assumed = gravity_of_map(gravity, references, where)
     remarks = [*remarks, *more, *_in_the_map(queries, references), *assumed]
     remarks += assumed_units(table) if "map" in table else []
-    return settings.scene(path, queries, references, down, remarks, assumed_down=bool(assumed), cloud=cloud)
+    truth_source = scene_file.text(table, "truth_source", where) if "truth_source" in table else ""
+    return settings.scene(
+        path,
+        queries,
+        references,
+        down,
+        remarks,
+        assumed_down=bool(assumed),
+        cloud=cloud,
+        truth_source=truth_source,
+    )
 
 
 def _cameras(table: dict[str, Any], path: Path) -> _Cameras:

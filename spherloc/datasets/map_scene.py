@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from spherloc.cameras.principal_point import about_principal_point
 from spherloc.datasets import scene_file
 from spherloc.datasets.query_gravity import BOUND_SD, GravitySettings, MeasuredGravity, read_gravity
 from spherloc.datasets.registration import Registration
@@ -78,7 +79,8 @@ class MapScene:
     cloud: FloatArray | None = None
     """Points (P, 3) of a map without a mesh, map frame, metres, for the canvas."""
     truth_source: str = ""
-    """What the true poses come from, if it knew more than a query's image is to tell; empty for a measurement."""
+    """What the true poses come from, if it knew more than a query's image is to tell or was aligned with the map; empty
+    for a measurement in the map's frame."""
     remarks: tuple[str, ...] = ()
     """What the loader skipped and why, in sentences."""
     matched_files: tuple[Path, ...] = ()
@@ -110,6 +112,16 @@ class MapScene:
             more = f" and {len(self.queries) - 5} more" if len(self.queries) > 5 else ""
             raise InputError(f"{self.where}: no query image {show(name)}; there are {some}{more}.")
         return self._by_name[name]
+
+    @property
+    def problem_remarks(self) -> tuple[str, ...]:
+        """The remarks that every problem of the scene has: ``remarks``, and where its true poses are from."""
+        return (*self.remarks, self.about_truth) if self.truth_source else self.remarks
+
+    @property
+    def about_truth(self) -> str:
+        """Where the true poses are from, as a sentence; empty for a measurement."""
+        return f"The true poses are those of {self.truth_source}." if self.truth_source else ""
 
     def prepare(self, report: Report) -> None:
         """Do what is needed once for all queries, so that it can be watched: describing a large map takes a while."""
@@ -163,7 +175,7 @@ class MapScene:
             reference_index=matches.reference_index,
             reference_pixels=matches.reference_pixels,
             estimated_outlier_rate=matches.estimated_outlier_rate,
-            remarks=(*self.remarks, *matches.remarks, *said),
+            remarks=(*self.problem_remarks, *matches.remarks, *said),
             verified_without_point=matches.verified_without_point,
         )
         if view.cam_from_map is None:
@@ -216,6 +228,16 @@ def _contradiction(stated: Gravity, nearby: Gravity | None) -> tuple[str, ...]:
         f"Gravity from {stated.source} is {angle_deg:.0f} degrees away from that of its most similar reference; it "
         "must point down, in the camera frame with x right, y down and z forward.",
     )
+
+
+def _about_cameras(views: Iterable[View]) -> list[str]:
+    """A remark on the first camera whose principal point seems to be wrong, and on how many others are like it."""
+    cameras = {view.camera: view.name for view in reversed(tuple(views))}
+    found = [
+        about for camera, name in cameras.items() if (about := about_principal_point(f"the camera of {name}", camera))
+    ]
+    more = [f"So it seems to be in {len(found) - 1} more of the {len(cameras)} cameras."] if len(found) > 1 else []
+    return found[-1:] + more
 
 
 REQUIRED = {"kind", "name"}
@@ -271,7 +293,7 @@ class MapSettings:
         wrong [frontend] and if there is no query or no reference.
         """
         given, asked = tuple(references), tuple(queries)
-        remarks = list(remarks)
+        remarks = [*remarks, *_about_cameras((*asked, *given))]
         if self.masks is not None:
             given, asked = self._masked(path, given, asked, remarks)
         gravity = self.gravity

@@ -185,7 +185,7 @@ def _judged(scene: MapScene, view: View, references: tuple[View, ...], trace: Tr
     judged, registration_error_m = judge(trace), None
     refinement = trace.stage(RefinementStage)
     expected = None if refinement is None or pose is None else refinement.expected_errors
-    remarks = tuple(dict.fromkeys((*row.remarks, *problem.remarks[len(scene.remarks) :])))
+    remarks = tuple(dict.fromkeys((*row.remarks, *problem.remarks[len(scene.problem_remarks) :])))
     if scene.registration is not None and pose is not None:
         try:
             registration_error_m = float(scene.registration(view, pose, references))

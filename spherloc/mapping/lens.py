@@ -1,4 +1,4 @@
-"""Writes a lens that COLMAP has no camera model for as a Kannala-Brandt camera, and doubts a calibration."""
+"""Writes a lens that COLMAP has no camera model for as a Kannala-Brandt camera."""
 
 from math import radians
 
@@ -7,7 +7,7 @@ import numpy as np
 from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_models import colmap_camera
 from spherloc.cameras.kannala_brandt import KannalaBrandt
-from spherloc.errors import CalibrationError, shorten
+from spherloc.errors import CalibrationError
 from spherloc.types import FloatArray
 
 MAX_OFF_PX = 0.5
@@ -15,9 +15,6 @@ MAX_OFF_PX = 0.5
 WIDEST_RAD = radians(85.0)
 """Directions farther from the optical axis do not count: COLMAP's fisheyes end at 90 degrees."""
 _GRID = 40
-OFF_CENTRE, NEAR_CENTRE = 0.1, 0.03
-"""Distances of a principal point from the middle of the image, in widths and heights: that of one whose coordinates may
-be exchanged, and of one that is right then."""
 
 
 def for_colmap(camera: Camera) -> tuple[Camera, str]:
@@ -30,21 +27,6 @@ def for_colmap(camera: Camera) -> tuple[Camera, str]:
     except CalibrationError:
         return _fitted(camera)
     return camera, ""
-
-
-def about_principal_point(name: str, camera: Camera) -> str:
-    """A sentence on a calibration, called ``name``, whose principal point is far from the middle of the image, while it
-    would be near it with x and y exchanged; else empty."""
-    pixels, seen = camera.project(np.array([[0.0, 0.0, 1.0]]))
-    size = np.array([camera.width, camera.height])
-    off, exchanged = (float(np.abs(point / size - 0.5).max()) for point in (pixels[0], pixels[0, ::-1]))
-    if not seen[0] or off < OFF_CENTRE or exchanged > NEAR_CENTRE:
-        return ""
-    x, y = pixels[0]
-    return (
-        f"The principal point of {shorten(name)} is at {x:.0f}, {y:.0f}, far from the middle of {camera.width} x "
-        f"{camera.height} pixels; if x and y are exchanged there, exchange them."
-    )
 
 
 def _fitted(camera: Camera) -> tuple[Camera, str]:

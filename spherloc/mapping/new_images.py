@@ -14,6 +14,7 @@ from spherloc.images import read_size
 from spherloc.mapping.frames import FrameChoice
 from spherloc.mapping.photographs import Photographs, cameras_of, with_cameras
 from spherloc.mapping.sequence import sequence_data
+from spherloc.mapping.true_poses import GroundTruth, ground_truth
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,8 @@ class NewImages:
     """With their cameras, named by the path in the folder; None for all images there, of the map's one camera."""
     gravity: Mapping[str, Gravity] = field(default_factory=dict)
     """That of a sequence's IMU, by name."""
+    truth: GroundTruth | None = None
+    """That of their sequence; None if there is none."""
 
 
 def new_images_of(
@@ -59,7 +62,8 @@ def new_images_of(
     data = sequence_data(folder, found.views, gravity=imu, positions=False)
     gravity = {} if data.stated is None else data.stated.found
     remarks = (*found.remarks, *data.remarks)
-    return NewImages(folder, None if all_there and all_its else found.views, gravity), remarks
+    truth = ground_truth(folder, found.views, mapped.views)
+    return NewImages(folder, None if all_there and all_its else found.views, gravity, truth), remarks
 
 
 def _all_of(folder: Path, camera: Camera) -> list[Path]:

@@ -10,6 +10,7 @@ from spherloc.datasets.scene_file import read_table, section
 from spherloc.errors import InputError, StoppedError, reason
 from spherloc.files import is_folder
 from spherloc.formats.colmap_files import read_model
+from spherloc.formats.colmap_model import ColmapModel
 from spherloc.frontend.view import View
 from spherloc.mapping.new_images import new_images_of
 from spherloc.mapping.photographs import Photographs, cameras_of, with_cameras
@@ -22,6 +23,7 @@ from spherloc.mapping.scene_files import (
     toml_value,
     write_new_scene,
 )
+from spherloc.mapping.true_poses import aligned_truth, truth_words
 
 SECTIONS = ("gravity", "frontend", "masks")
 """Sections of a scene file that are the same for all queries of a map."""
@@ -34,6 +36,11 @@ def map_images(scene: Path) -> Path | None:
     """
     own = _map_of(read_table(scene))
     return None if own is None or not is_folder(scene.parent / MODEL) else scene.parent / own["images"]
+
+
+def map_size(scene: Path) -> int:
+    """Number of images of the map with that scene file; raises ``InputError`` if its model cannot be read."""
+    return len(read_model(scene.parent / MODEL).images)
 
 
 def _map_of(table: Mapping[str, Any]) -> Mapping[str, Any] | None:
@@ -55,8 +62,13 @@ def add_new_images(scene: Path, folder: Path) -> tuple[Path, tuple[str, ...]]:
     own = _map_of(table)
     if images is None or own is None:
         raise InputError(f"{scene.name}: is not the scene of a map; open one that spherloc map made, or the page.")
-    mapped = _mapped(scene.parent / MODEL, images)
+    model = read_model(scene.parent / MODEL)
+    mapped = _mapped(model, images)
     new_images, remarks = new_images_of(folder, mapped)
+    truth = None
+    if new_images.truth is not None:
+        truth = aligned_truth(new_images.truth, {one.name: one.cam_from_map for one in model.images.values()})
+        remarks = (*remarks, truth_words(truth))
     gravity_of_map = table.get("gravity")
     if isinstance(gravity_of_map, dict) and gravity_of_map.get("file") == GRAVITY:
         table = table | {"gravity": {key: value for key, value in gravity_of_map.items() if key != "file"}}
@@ -68,7 +80,7 @@ def add_new_images(scene: Path, folder: Path) -> tuple[Path, tuple[str, ...]]:
         sections=tuple(line for name in SECTIONS for line in _section(table, name, str(scene))),
     )
     try:
-        return write_new_scene(head, scene.parent, new_images, mapped.views[0].camera), remarks
+        return write_new_scene(head, scene.parent, new_images, mapped.views[0].camera, truth), remarks
     except OSError as error:
         raise StoppedError(
             f"{scene.parent}: cannot be written ({reason(error)}); make room there or allow it."
@@ -81,10 +93,9 @@ def _name(table: Mapping[str, Any]) -> str:
     return name.removeprefix(f"{others} in ") if "map" in table else name
 
 
-def _mapped(model_folder: Path, images: Path) -> Photographs:
+def _mapped(model: ColmapModel, images: Path) -> Photographs:
     """The images of the map with their cameras; where it has several, by the folders of their images, else as the
     calibrations beside these name them, else by COLMAP's numbers."""
-    model = read_model(model_folder)
     views = tuple(View(one.name, model.camera(one.camera_id), images / one.name) for one in model.images.values())
     if len(cameras_of(views)) == 1:
         return Photographs(views, (), {})

@@ -10,6 +10,7 @@ import numpy as np
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.cameras.principal_point import about_principal_point
 from spherloc.datasets.asl import asl_cameras, image_times
 from spherloc.datasets.asl_layout import DATA, SENSOR, AslSequence, asl_sequence
 from spherloc.datasets.given_path import SCENE, images_below, images_in_folders, what_it_is
@@ -21,7 +22,7 @@ from spherloc.images import check_image, grey, read_eighth, read_image
 from spherloc.mapping.advice import advice
 from spherloc.mapping.frames import MAX_IMAGES, FrameChoice, ImageFolder, chosen
 from spherloc.mapping.image_circle import BLACK
-from spherloc.mapping.lens import about_principal_point, for_colmap
+from spherloc.mapping.lens import for_colmap
 from spherloc.trajectory import NS_PER_S
 from spherloc.types import ByteArray
 

@@ -68,6 +68,10 @@ class SimilarityFit:
 
     scale: float
     """Metres per unit of the points."""
+    rotation: FloatArray
+    """(D, D), from the frame of the points to that of the positions."""
+    translation: FloatArray
+    """(D,), m."""
     scale_sd: float
     """Relative standard deviation of the scale, from the distances after the alignment."""
     off_m: FloatArray
@@ -280,7 +284,7 @@ def overlaid(points: FloatArray, positions: FloatArray) -> SimilarityFit:
     off = _off(fit, points, positions)
     variance = float(np.sum(off[near] ** 2)) / max(1, size * int(near.sum()) - unknowns)
     spread = float(np.sum((positions[near] - positions[near].mean(axis=0)) ** 2))
-    return SimilarityFit(float(fit[0]), float(np.sqrt(variance / spread)), off, near)
+    return SimilarityFit(*fit, float(np.sqrt(variance / spread)), off, near)
 
 
 def _samples(count: int, size: int) -> list[list[int]]:

@@ -21,6 +21,7 @@ from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.new_images import NewImages
 from spherloc.mapping.photographs import CalibratedLens, cameras_of
+from spherloc.mapping.true_poses import AlignedTruth
 
 MODEL = "model"
 """Folder of COLMAP's model in that of the map."""
@@ -76,23 +77,37 @@ def scene_text(head: MapHead, names: Sequence[str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def new_scene_text(head: MapHead, folder: Path, new_images: NewImages, camera: Camera) -> str:
+def new_scene_text(
+    head: MapHead, folder: Path, new_images: NewImages, camera: Camera, truth: AlignedTruth | None = None
+) -> str:
     """The scene of images that are to be localized in the map in ``folder``; ``camera`` is theirs where ``new_images``
-    do not say."""
+    do not say, and ``truth`` has their true poses."""
     lines = [
         'kind = "image-folder"',
         f"name = {toml_text(f'{new_images.folder.resolve().name} in {head.name}')}",
         f"about = {toml_text(head.about)}",
         f"images = {toml_text(relative(new_images.folder, folder))}",
         head.units,
+        *([] if truth is None else [_about_truth(truth)]),
         *_queries(new_images.views or (), camera),
         "",
         "[map]",
         f"model = {toml_text(MODEL)}",
         f"images = {toml_text(head.images)}",
         *head.sections,
+        *([] if truth is None else _true_poses(truth)),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _about_truth(truth: AlignedTruth) -> str:
+    """The line on what true poses are from, or on why there are none."""
+    return f"truth_source = {toml_text(truth.said)}" if truth.poses else f"# No true poses: {truth.said}."
+
+
+def _true_poses(truth: AlignedTruth) -> list[str]:
+    rows = (f"{toml_text(name)} = {json.dumps(pose.tolist())}" for name, pose in truth.poses.items())
+    return ["", "[truth]", *rows] if truth.poses else []
 
 
 def _queries(views: Sequence[View], camera: Camera) -> list[str]:
@@ -166,14 +181,16 @@ def write_lenses(folder: Path, lenses: Mapping[str, CalibratedLens]) -> None:
         path.write_text("\n".join([*about, "[camera]", *_camera(camera)]) + "\n", encoding="utf-8")
 
 
-def write_new_scene(head: MapHead, folder: Path, new_images: NewImages, camera: Camera) -> Path:
+def write_new_scene(
+    head: MapHead, folder: Path, new_images: NewImages, camera: Camera, truth: AlignedTruth | None = None
+) -> Path:
     """Write the file of ``new_scene_text``; returns its path. Raises ``OSError``."""
     path = folder / f"{_file_name(new_images.folder)}.toml"
     if new_images.gravity:
         file = path.with_suffix("").with_name(f"{path.stem}_{GRAVITY}")
         write_gravity(file, new_images.gravity)
         head = head.with_gravity(file.name)
-    path.write_text(new_scene_text(head, folder, new_images, camera), encoding="utf-8")
+    path.write_text(new_scene_text(head, folder, new_images, camera, truth), encoding="utf-8")
     return path
 
 

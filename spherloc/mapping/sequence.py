@@ -1,13 +1,14 @@
 """Gravity and positions of the images of a sequence in the ASL layout (EuRoC, TUM-VI), by IMU and ground truth."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.datasets.asl import IMU, AslCamera, asl_cameras, body_from
+from spherloc.datasets.asl import IMU, AslCamera, asl_cameras, body_from, image_times
 from spherloc.datasets.asl_layout import MAV, SENSOR, TABLE, AslSequence, asl_sequence
 from spherloc.datasets.imu import down_at, read_imu
 from spherloc.datasets.query_gravity import time_of
@@ -43,14 +44,14 @@ def sequence_data(folder: Path, views: Sequence[View], *, gravity: bool = True, 
     sequence = asl_sequence(folder)
     if sequence is None:
         return SequenceData()
-    shots = _shots(sequence, views)
+    shots = shots_of_sequence(sequence, views)
     stated, about_gravity = _gravity(sequence, shots) if gravity else (None, [])
     places, about_positions = _positions(sequence, shots) if positions else (None, [])
     return SequenceData(stated, places, (*about_gravity, *about_positions))
 
 
 @dataclass(frozen=True, eq=False)
-class _Shot:
+class SequenceShot:
     """An image with its camera."""
 
     name: str
@@ -60,37 +61,49 @@ class _Shot:
     calibrated: AslCamera | None
     """None without a calibration in the sequence."""
 
+    @property
+    def body_from_camera(self) -> FloatArray | None:
+        """(4, 4), metres; None if no file says it."""
+        return None if self.calibrated is None else self.calibrated.body_from_camera
 
-def _shots(sequence: AslSequence, views: Sequence[View]) -> list[_Shot]:
+
+def shots_of_sequence(sequence: AslSequence, views: Sequence[View]) -> list[SequenceShot]:
+    """The images of a sequence, with their cameras; those of ``views`` that are not in it are left out."""
     cameras = asl_cameras(sequence).by_name
-    names = {images: name for name, images in sequence.cameras.items()}
+    names = {images.resolve(): name for name, images in sequence.cameras.items()}
+    in_table = cache(lambda images: image_times(images).times_ns)
+    folders = {folder: folder.resolve() for folder in {view.path.parent for view in views}}
     found = []
     for view in views:
-        name = names[view.path.parent]
+        name = names.get(folders[view.path.parent])
+        if name is None:
+            continue
         own = cameras.get(name)
         shift_ns = 0 if own is None else round(own.shift_s * NS_PER_S)
         time_ns = time_of(view)
-        found.append(_Shot(view.name, name, None if time_ns is None else time_ns + shift_ns, own))
+        if time_ns is None:
+            time_ns = in_table(view.path.parent).get(view.path.name)
+        found.append(SequenceShot(view.name, name, None if time_ns is None else time_ns + shift_ns, own))
     return found
 
 
-def _gravity(sequence: AslSequence, shots: Sequence[_Shot]) -> tuple[StatedGravity | None, list[str]]:
+def _gravity(sequence: AslSequence, shots: Sequence[SequenceShot]) -> tuple[StatedGravity | None, list[str]]:
     """Gravity by the log of the IMU, and remarks."""
     log = sequence.sensor(IMU) / TABLE
     if not is_file(log):
         return None, []
-    loose = sorted({shot.camera for shot in shots if _body_from_camera(shot) is None})
+    loose = sorted({shot.camera for shot in shots if shot.body_from_camera is None})
     if len(loose) == len({shot.camera for shot in shots}):
         return None, [f"{log}: is not used, as no file says {_fixed(loose)}."]
     try:
         samples, body_from_imu = read_imu(log), body_from(sequence.sensor(IMU))
     except (CalibrationError, InputError) as error:
         return None, [f"{error} It is not used for gravity."]
-    timed = [shot for shot in shots if shot.time_ns is not None and _body_from_camera(shot) is not None]
+    timed = [shot for shot in shots if shot.time_ns is not None and shot.body_from_camera is not None]
     down_imu = down_at(samples, np.array([shot.time_ns for shot in timed], np.int64))
     found = {}
     for shot, down in zip(timed, down_imu, strict=True):
-        body_from_camera = _body_from_camera(shot)
+        body_from_camera = shot.body_from_camera
         if body_from_camera is not None and np.isfinite(down).all():
             down = body_from_camera[:3, :3].T @ body_from_imu[:3, :3] @ down
             found[shot.name] = Gravity(down / np.linalg.norm(down), "the IMU", BOUND_RAD)
@@ -108,36 +121,26 @@ def _gravity(sequence: AslSequence, shots: Sequence[_Shot]) -> tuple[StatedGravi
     return StatedGravity(found, log, None, (), in_map_folder=True), remarks
 
 
-def _positions(sequence: AslSequence, shots: Sequence[_Shot]) -> tuple[Positions | None, list[str]]:
+def _positions(sequence: AslSequence, shots: Sequence[SequenceShot]) -> tuple[Positions | None, list[str]]:
     """Positions of the cameras by the first ground truth that has enough of them, and remarks."""
     remarks: list[str] = []
-    for name in TRUTHS:
-        table = sequence.sensor(name) / TABLE
-        if not is_file(table):
-            continue
-        try:
-            trajectory, body_from_sensor = read_positions_or_poses(table), body_from(sequence.sensor(name))
-        except (CalibrationError, InputError) as error:
-            remarks.append(f"{error} It is not used for the scale.")
-            continue
+    for truth in readable_truths(sequence, remarks):
         found = {}
         for shot in shots:
-            pose = None if shot.time_ns is None else pose_at(trajectory.poses, shot.time_ns, MAX_GAP_S)
-            if pose is None:
-                continue
-            found[shot.name] = pose[:, 3]
-            body_from_camera = _body_from_camera(shot)
-            if trajectory.turned and body_from_camera is not None:
-                sensor_from_camera = np.linalg.inv(body_from_sensor) @ body_from_camera
-                found[shot.name] = pose[:, :3] @ sensor_from_camera[:3, 3] + pose[:, 3]
+            pose = truth.pose_at(shot)
+            if pose is not None:
+                camera = truth.camera_pose_at(shot)
+                found[shot.name] = pose[:, 3] if camera is None else camera[:, 3]
         if len(found) < MIN_POSITIONS:
             few = f"it has a position at the time of {len(found)} of {len(shots)} images"
-            span = _span(shots, trajectory.poses.timestamps_ns)
-            remarks.append(f"{table}: is not used for the scale, as {few}: {span}.")
+            span = _span(shots, truth.places.poses.timestamps_ns)
+            remarks.append(f"{truth.table}: is not used for the scale, as {few}: {span}.")
             continue
-        told = f"The scale is from {sequence.called(table)}, with positions of {len(found)} of {len(shots)} images"
+        told = (
+            f"The scale is from {sequence.called(truth.table)}, with positions of {len(found)} of {len(shots)} images"
+        )
         remarks.append(f"{told}; {advice('other positions')}.")
-        return Positions(found, f"the trajectory {name}/{TABLE}"), remarks
+        return Positions(found, f"the trajectory {truth.name}/{TABLE}"), remarks
     return None, remarks
 
 
@@ -147,6 +150,43 @@ class TimedPlaces:
 
     poses: Trajectory
     turned: bool
+
+
+@dataclass(frozen=True, eq=False)
+class SensorTruth:
+    """The ground truth of a sensor of a sequence."""
+
+    name: str
+    """Folder of the sensor."""
+    table: Path
+    places: TimedPlaces
+    body_from_sensor: FloatArray
+    """(4, 4), metres."""
+
+    def pose_at(self, shot: SequenceShot) -> FloatArray | None:
+        """``truth_from_sensor`` (3, 4) when an image was taken; None where it is not known."""
+        return None if shot.time_ns is None else pose_at(self.places.poses, shot.time_ns, MAX_GAP_S)
+
+    def camera_pose_at(self, shot: SequenceShot) -> FloatArray | None:
+        """``truth_from_camera`` (3, 4) of an image; None where it is not known, as without rotations."""
+        pose, body_from_camera = self.pose_at(shot), shot.body_from_camera
+        if pose is None or body_from_camera is None or not self.places.turned:
+            return None
+        sensor_from_camera = np.linalg.inv(self.body_from_sensor) @ body_from_camera
+        turn = pose[:, :3] @ sensor_from_camera[:3, :3]
+        return np.column_stack([turn, pose[:, :3] @ sensor_from_camera[:3, 3] + pose[:, 3]])
+
+
+def readable_truths(sequence: AslSequence, remarks: list[str]) -> Iterator[SensorTruth]:
+    """The ground truths of a sequence, the best first; what is wrong with others is added to ``remarks``."""
+    for name in TRUTHS:
+        table = sequence.sensor(name) / TABLE
+        if not is_file(table):
+            continue
+        try:
+            yield SensorTruth(name, table, read_positions_or_poses(table), body_from(sequence.sensor(name)))
+        except (CalibrationError, InputError) as error:
+            remarks.append(f"{error} It is not used for the scale.")
 
 
 def read_positions_or_poses(path: Path) -> TimedPlaces:
@@ -172,11 +212,7 @@ def read_positions_or_poses(path: Path) -> TimedPlaces:
         raise InputError(f"{path}: {error}") from None
 
 
-def _body_from_camera(shot: _Shot) -> FloatArray | None:
-    return None if shot.calibrated is None else shot.calibrated.body_from_camera
-
-
-def _span(shots: Sequence[_Shot], times_ns: NDArray[np.int64]) -> str:
+def _span(shots: Sequence[SequenceShot], times_ns: NDArray[np.int64]) -> str:
     """How the times of images and of a log lie to each other, in words."""
     known = [shot.time_ns for shot in shots if shot.time_ns is not None]
     if not known:

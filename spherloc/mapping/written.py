@@ -28,6 +28,7 @@ from spherloc.mapping.scene_files import (
     write_new_scene,
 )
 from spherloc.mapping.stated_gravity import StatedGravity
+from spherloc.mapping.true_poses import AlignedTruth, aligned_truth
 from spherloc.mapping.upright import Level, MapScale, upright_frame
 from spherloc.registry import require
 from spherloc.types import FloatArray
@@ -51,6 +52,8 @@ class Written:
     """(N, 3), map frame, in the map's unit."""
     error_px: float
     """Mean reprojection error, px."""
+    truth: AlignedTruth | None = None
+    """True poses of the other images; None if nothing tells of them."""
 
 
 @dataclass(frozen=True)
@@ -109,12 +112,13 @@ def write_map(
             own = NewImages(images, tuple(view for view in views if view.name in poses))
             content = new_scene_text(own_head, folder, own, views[0].camera)
         scene.write_text(content, encoding="utf-8")
-        new_scene = None
+        new_scene = truth = None
         if new_images is not None:
-            new_scene = write_new_scene(head, folder, new_images, views[0].camera)
+            truth = None if new_images.truth is None else aligned_truth(new_images.truth, poses)
+            new_scene = write_new_scene(head, folder, new_images, views[0].camera, truth)
     except (OSError, RuntimeError) as error:
         raise StoppedError(f"{folder}: cannot be written ({reason(error)}); {advice('go on')}.") from None
-    return Written(scene, new_scene, poses, made.points(), float(made.model.compute_mean_reprojection_error()))
+    return Written(scene, new_scene, poses, made.points(), float(made.model.compute_mean_reprojection_error()), truth)
 
 
 def _about(made: Reconstruction, level: Level, scale: MapScale, count: int) -> str:

@@ -14,6 +14,7 @@ from spherloc_viz.app.catalog import Run
 from spherloc_viz.app.controls.controls import DisplayControls
 from spherloc_viz.app.edits import Edits
 from spherloc_viz.app.run_display import Callbacks, RunDisplay
+from spherloc_viz.app.said_together import SaidTogether
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Status
@@ -44,6 +45,10 @@ class AudienceControls:
     def items(self, run: Run, hidden: bool) -> tuple[SceneItem, ...]:
         """Nothing beside the run."""
         return ()
+
+    def said_together(self, run: Run) -> SaidTogether | None:
+        """Nothing: results of all queries are on the presenter's page."""
+        return None
 
     def draw(self, run: Run, diagnosis: Diagnosis | None, hidden: bool) -> None:
         """Nothing here depends on the run."""

@@ -19,7 +19,15 @@ from spherloc_viz.app.plots.charts import ChartPanel
 from spherloc_viz.app.plots.graph_view import GraphView
 from spherloc_viz.app.plots.residual_view import ResidualView
 from spherloc_viz.app.plots.yaw_view import YawView
-from spherloc_viz.app.text import legend_html, opening_card_html, opening_html, stale_html, summary_html, table_html
+from spherloc_viz.app.text import (
+    ToldBeside,
+    legend_html,
+    opening_card_html,
+    opening_html,
+    stale_html,
+    summary_html,
+    table_html,
+)
 from spherloc_viz.app.web.touch import READY, Touch, Touches, pixels_of, seen_views
 from spherloc_viz.app.web.viser_internals import update_widget
 from spherloc_viz.layers import graph_begins, steps
@@ -93,12 +101,11 @@ class LeftPanels:
         selected: tuple[int, ...],
         hidden: bool,
         offered: str = "",
-        cause: tuple[str, str] = ("", ""),
+        beside: ToldBeside = ToldBeside(),  # noqa: B008 -- frozen
     ) -> None:
         """Show a step of a run, in the views that are to be seen. ``selected`` are numbers in the problem; ``hidden``
         says that what came out is not to be told: then run and picture are without it. ``offered`` is HTML that says
-        which answers are hidden, and ``cause`` what is wrong with the run and, at its last step, a sentence on
-        where its query was taken."""
+        which answers are hidden, and ``beside`` what is told beside the run's verdict."""
         kept: NDArray = run.kept
         tables = [table for table in picture.tables if table.name != outcome.name]
         self.steps.show(picture.step, playing, tables)
@@ -117,7 +124,7 @@ class LeftPanels:
             self._lens.draw(run, hidden)
         if "Matches" in seen:
             self.matches.draw(run.trace, selected, kept, hidden)
-        summary, ending = ("", "") if hidden else (summary_html(run.trace, *cause), table_html(outcome, linked))
+        summary, ending = ("", "") if hidden else (summary_html(run.trace, beside), table_html(outcome, linked))
         summary = offered + summary
         if self._opening == run.request.scene.scene:
             self._opening = self._card.content = ""

@@ -23,9 +23,18 @@ from spherloc_viz.app.left_panels import LeftPanels
 from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.plots.graph_view import CLIQUE_STEP
+from spherloc_viz.app.said_together import SaidTogether
 from spherloc_viz.app.stage.canvas import Canvas, panel_widths_px, text_scale
 from spherloc_viz.app.stage.subjects import walk_at_end
-from spherloc_viz.app.text import cause_html, evidence_html, hidden_html, key_step_html, status_html, summary_of
+from spherloc_viz.app.text import (
+    ToldBeside,
+    cause_html,
+    evidence_html,
+    hidden_html,
+    key_step_html,
+    status_html,
+    summary_of,
+)
 from spherloc_viz.app.web.touch import Touch, Touches, pixels_of
 from spherloc_viz.app.web.viser_internals import changes_of, sent_at_once, set_theme
 from spherloc_viz.layers import paint, steps, with_alternative
@@ -61,6 +70,10 @@ class Panel(Protocol):
 
     def items(self, run: Run, hidden: bool) -> tuple[SceneItem, ...]:
         """What the canvas shows beside a run; ``hidden`` leaves out what would tell the answers."""
+        ...
+
+    def said_together(self, run: Run) -> SaidTogether | None:
+        """What other queries say of that of a run; None if nothing."""
         ...
 
     def draw(self, run: Run, diagnosis: Diagnosis | None, hidden: bool) -> None:
@@ -229,7 +242,9 @@ class RunDisplay:
             offered = hidden_html(withheld, not presenter) if withheld else ""
             where = self._where(run) if last and not hidden else ""
             cause = str(diagnosis.cause) if diagnosis is not None and diagnosis.doubtful else ""
-            self.panels.draw(run, plain, pause is not None, outcome, selected, not told, offered, (cause, where))
+            together = None if hidden else controls.said_together(known)
+            words = ToldBeside(cause, where, together)
+            self.panels.draw(run, plain, pause is not None, outcome, selected, not told, offered, words)
             self.panels.diagnose(*("", "") if hidden else _diagnosed_html(trace, diagnosis, index))
             right = partial(self.canvas.card_is_right, drawn)
             self.card.draw(trace, selected, run.kept, alternative, right, not told)

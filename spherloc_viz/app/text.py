@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from html import escape
 
 import numpy as np
@@ -11,6 +12,7 @@ from spherloc.metrics import evaluate
 from spherloc.outcome import Outcome, known_judgement
 from spherloc.trace import Trace
 from spherloc_viz import style
+from spherloc_viz.app.said_together import SaidTogether
 from spherloc_viz.layers.comparison import duration_text
 from spherloc_viz.layers.frame import angle_text, length
 from spherloc_viz.layers.outcome import UNKNOWABLE, verdict
@@ -176,9 +178,21 @@ def summary_of(trace: Trace) -> tuple[str, list[str]]:
     return verdict(trace, metrics.success), facts
 
 
-def summary_html(trace: Trace, cause: str = "", where: str = "") -> str:
-    """A run in one line; ``cause`` is what is wrong with it, if that is to be told, and ``where`` a sentence on where
-    its query was taken."""
+@dataclass(frozen=True)
+class ToldBeside:
+    """What is told of a run beside its own verdict."""
+
+    cause: str = ""
+    """What is wrong with it, if that is to be told."""
+    where: str = ""
+    """A sentence on where its query was taken."""
+    together: SaidTogether | None = None
+    """What other queries say of it."""
+
+
+def summary_html(trace: Trace, beside: ToldBeside = ToldBeside()) -> str:
+    """A run in one line, and sentences on where its query was taken and what other queries say of it."""
+    cause, together = beside.cause, beside.together
     words, facts = summary_of(trace)
     doubt = ", but in doubt" if cause and words == "success" else ""
     told = f"{words.capitalize()}{doubt}: {cause}" if cause else words.capitalize()
@@ -189,8 +203,14 @@ def summary_html(trace: Trace, cause: str = "", where: str = "") -> str:
         else escape(fact)
         for fact in facts
     )
-    line = f'<b style="{_value_css(words)}">{escape(told)}</b> · ' + " · ".join(shown)
-    return box(line + (f"<div>{escape(where)}</div>" if where else ""), "font-size:12.5px;padding-top:.2em")
+    line = f'<b style="{_value_css(words)}">{escape(told)}</b>'
+    if together is not None:
+        status = f'<b style="{_value_css(together.status)}">{escape(together.status)}</b>'
+        line += f" by itself, {status} in the results of all queries"
+    line = " · ".join((line, *shown))
+    sentences = (beside.where, "" if together is None else together.why)
+    more = "".join(f"<div>{escape(sentence)}</div>" for sentence in sentences if sentence)
+    return box(line + more, "font-size:12.5px;padding-top:.2em")
 
 
 def _value_css(value: object) -> str:

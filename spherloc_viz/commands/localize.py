@@ -127,6 +127,8 @@ def compare_sequences(
     code, found = 0, []
     for path, several in solvings.items():
         done = localized(path, several, seed, queries, retry_failed)
+        if done.scene.about_truth:
+            say(f"{path}: {done.scene.about_truth}")
         labels = [solving.label for solving in several]
         found += [
             Compared(label, item, summarize(item), done.backdrop)
@@ -176,8 +178,6 @@ def localized(
     hows = [_how(scene, item, seed) for item in solvings]
     for remark in scene.remarks:
         say(remark)
-    if scene.truth_source:
-        say(f"the true poses are those of {scene.truth_source}.")
     with ExitStack() as stack:
         logs: list[ResultsLog] = []
         settings = [
@@ -272,7 +272,7 @@ def _work(
 
 def _judge_together(scene: MapScene, log: ResultsLog, how: How, recorder_of: "Callable[[], _Recorder | None]") -> None:
     """Judge the queries of a log by each other; what is changed is written at once, and what was tried anew is recorded
-    where ``recorder_of`` gives a recorder."""
+    where ``recorder_of`` gives a recorder, in the place of the recording before."""
     with _told_if_stopped([log]), ExitStack() as stack:
         bars: list[Callable[[str], None]] = []
 
@@ -282,9 +282,12 @@ def _judge_together(scene: MapScene, log: ResultsLog, how: How, recorder_of: "Ca
             bars[0]("")
 
         for row, trace in judged_together(scene, log.results().rows, how, report, say):
-            if trace is not None and (recorder := recorder_of()) is not None:
+            first, recorder = log.rows[row.query].recording, recorder_of() if trace is not None else None
+            if trace is not None and recorder is not None:
                 row = replace(row, recording=recorder.record(trace, row.query))
             log.change([row])
+            if recorder is not None and first is not None and row.recording not in (None, first):
+                recorder.forget(first, row.query)
 
 
 @contextmanager
@@ -330,6 +333,17 @@ class _Recorder:
             return path.resolve().relative_to(log.folder.resolve()).as_posix()
         except ValueError:
             return str(path.resolve())
+
+    def forget(self, recording: str, query: str) -> None:
+        """Delete the recording, a path of the results, of a query that was recorded anew."""
+        path = self.log.folder / recording
+        try:
+            gone = self.store.delete(path)
+        except RecordingError as error:
+            say(f"{path}: stays, although {query} was tried anew and recorded since: {error}")
+            return
+        if not gone:
+            say(f"{path}: stays, although {query} was tried anew and recorded since; delete it if you do not need it.")
 
 
 def _finish(log: ResultsLog, results: SequenceResults, scene: MapScene, backdrop: "Backdrop") -> None:

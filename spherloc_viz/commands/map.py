@@ -58,6 +58,7 @@ from spherloc.mapping.scene_files import (
 )
 from spherloc.mapping.sequence import sequence_data
 from spherloc.mapping.stated_gravity import read_stated_gravity
+from spherloc.mapping.true_poses import truth_words
 from spherloc.registry import require
 from spherloc.types import FloatArray
 from spherloc_viz.commands.map_report import MAP_FEATURES, map_report, summary
@@ -143,6 +144,8 @@ def make(
         print(f"lens          {target / LENS}, for other images of that camera: --camera {lens}")
     if others is not None:
         print(f"new images    {_sizes(others)}")
+        if made.written.truth is not None:
+            print(f"truth         {truth_words(made.written.truth)}")
     elif found.others:
         print(f"other images  {found.others:,}, of which --localize {shlex.quote(str(folder))} localizes some")
     if older := _of_the_map_before(target, made):

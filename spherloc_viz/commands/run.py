@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spherloc.datasets import Scene, load_scene
+from spherloc.datasets.correspondences import CorrespondencesScene
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.variation import Variation, used_seed
 from spherloc.diagnosis import Diagnosis, diagnose
@@ -143,10 +144,12 @@ def _problem(path: Path, scene: Scene, seed: int | None, query: str | None, vari
     try:
         changed = variation.scene(scene)
         if not isinstance(changed, MapScene):
+            for remark in changed.measured.remarks if isinstance(changed, CorrespondencesScene) else ():
+                say(remark)
             return variation.problem(scene, seed, query)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    for remark in changed.remarks:
+    for remark in changed.problem_remarks:
         say(remark)
     view = changed.query(query)
     say(f"{path}: reading and matching images; what is new to this machine takes a while")
@@ -155,7 +158,7 @@ def _problem(path: Path, scene: Scene, seed: int | None, query: str | None, vari
     for remark in matches.remarks:
         say(remark)
     problem = changed.problem_of(view, matches)
-    for remark in problem.remarks[len(changed.remarks) + len(matches.remarks) :]:
+    for remark in problem.remarks[len(changed.problem_remarks) + len(matches.remarks) :]:
         say(remark)
     return variation.edit(problem, used_seed(scene, seed))
 

@@ -46,6 +46,8 @@ def sequence_text(results: SequenceResults, summary: Summary, scene: MapScene) -
             f"{setting.length(summary.median_translation_error_m)}, of queries with a pose"
         )
     lines += [f"  {line}" for line in _trajectory_lines(summary.trajectory, setting)]
+    if scene.about_truth and summary.success:
+        lines.append(f"  {scene.about_truth[0].lower()}{scene.about_truth[1:].removesuffix('.')}")
     if summary.median_registration_error_m is not None:
         lines.append(f"  median registration error {setting.length(summary.median_registration_error_m)}")
     if summary.mean_f1 is not None:

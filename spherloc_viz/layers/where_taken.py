@@ -26,9 +26,12 @@ def where_taken(scene: MapScene, trace: Trace) -> str:
     told = nearest(scene, trace.cam_from_map, image)
     if not told:
         return ""
-    truth = trace.problem.truth_cam_from_map
+    truth = ""
+    if trace.problem.truth_cam_from_map is not None:
+        source = scene.truth_source.partition(":")[0]  # what follows are numbers
+        truth = f" Its truth is that of {source}." if source else " Its truth is the pose that the map's files give it."
     more = " It is an image of the map itself." if any(view.path == image for view in scene.references) else ""
-    return f"Taken {told}.{more}" + ("" if truth is None else " Its truth is the pose that the map's files give it.")
+    return f"Taken {told}.{more}{truth}"
 
 
 def nearest(scene: MapScene, cam_from_map: FloatArray, image: Path | None) -> str:

@@ -12,6 +12,7 @@ from playwright.sync_api import Browser, expect
 
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.map_scene import MapScene
+from spherloc.experiments.results import ResultsLog, read_results
 from spherloc_viz.commands.localize import Solving, localize_sequence
 from spherloc_viz.recording.content.data import read_recording
 
@@ -49,15 +50,21 @@ stop = 0.25
 """
 
 
+DOUBT = "Taken together with b.png, it should be 3.2 m from where it is found."
+
+
 @pytest.fixture(scope="module")
 def images_address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
     """Address of a playground with a small rendered scene, and where it records. A query of a scene beside it was
-    localized before."""
+    localized before, and doubted."""
     folder = tmp_path_factory.mktemp("images")
     (folder / "small.toml").write_text(SCENE)
     (folder / "fisheye.toml").write_text(SCENE.replace(PANORAMA, FISHEYE).replace("small", "fisheye"))
     before = Solving("ransac-2p", (), folder / "recordings" / "kept", None)
     assert localize_sequence(folder / "fisheye.toml", [before], 0, ["query_001"], retry_failed=False) == 0
+    found = read_results(before.output)
+    with ResultsLog(before.output, found.configuration) as log:
+        log.change([found.rows[0].doubted(DOUBT)])
     with served(folder / "small.toml", "--recordings", folder / "recordings") as (found, _):
         yield found, folder / "recordings"
 
@@ -225,6 +232,13 @@ def test_the_query_on_the_sphere_and_the_mesh_around_it(
     expect(tab.page.get_by_text("Localized before by ransac-2p: kept.")).to_be_visible()
     expect(tab.value("queries")).to_have_text("1 of 3")
     tab.until(lambda: tab.instances("/trajectory/queries") == 1, "it has its dot")
+    beside = tab.page.get_by_text("by itself, doubtful in the results of all queries")
+    expect(beside).to_have_count(0)
+    tab.touch("strip-open:query_001").click()
+    expect(beside).to_be_visible()
+    expect(tab.page.get_by_text(DOUBT, exact=True)).to_be_visible()
+    tab.touch("strip-open:query_000").click()
+    expect(beside).to_have_count(0)
     tab.press("Sphere")  # at the outcome, the view shows where the localized photograph was taken
     tab.until(lambda: visible("/sphere/image") and tab.node("/sphere/image") != panorama, "another image")
     tab.expect_quiet(images_address[0])

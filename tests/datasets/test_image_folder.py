@@ -64,6 +64,40 @@ def test_a_folder_of_queries_in_the_order_of_names(tmp_path):
     assert scene.queries[0].gravity is None and scene.gravity_bound_rad == pytest.approx(np.radians(3))
 
 
+def test_what_true_poses_are_from_is_told_with_every_problem(tmp_path):
+    truth = f'[truth]\n"b.png" = {POSE}\n'
+    head = 'images = "queries"\ntruth_source = "mocap0/data.csv, which was aligned with the map"'
+    scene = load_scene(make_tree(tmp_path, CAMERA + POSED + truth, head=head))
+    assert scene.about_truth == "The true poses are those of mocap0/data.csv, which was aligned with the map."
+    assert scene.remarks == scene.problem_remarks[:-1] and scene.problem_remarks[-1] == scene.about_truth
+    measured = load_scene(make_tree(tmp_path, CAMERA + POSED + truth))
+    assert not measured.about_truth and measured.problem_remarks == measured.remarks
+    with pytest.raises(InputError, match="truth_source"):
+        load_scene(make_tree(tmp_path, CAMERA + POSED, head='images = "queries"\ntruth_source = 3'))
+
+
+@pytest.mark.parametrize(
+    ("middle", "said"),
+    [
+        ("cx = 32, cy = 16", ""),
+        ("cx = 40, cy = 10", ""),
+        ("cx = 16, cy = 32", "is at 16, 32, far from the middle of 64 x 32 pixels; if x and y are exchanged there"),
+        ("cx = 70, cy = 16", "is at 70, 16, outside of 64 x 32 pixels; if the images are not cropped"),
+    ],
+)
+def test_a_principal_point_that_seems_to_be_wrong_is_told_once(tmp_path, middle, said):
+    lens = f'model = "eucm", width = 64, height = 32, fx = 20, fy = 20, {middle}, alpha = 0.5, beta = 1.0'
+    entry = f'[[cameras]]\nimages = "{{}}"\ncamera = {{{{{lens}}}}}\n'
+    reference = POSED.replace("cam_from_map", CAMERA_OF + "cam_from_map")
+    remarks = load_scene(make_tree(tmp_path, entry.format("b*") + entry.format("a*") + reference)).remarks
+    told = [remark for remark in remarks if "principal point" in remark]
+    assert len(told) == bool(said) and all(f"of the camera of a.jpg {said}" in remark for remark in told), remarks
+    other = lens.replace("beta = 1.0", "beta = 1.1")
+    both = f'[[cameras]]\nimages = "b*"\ncamera = {{{other}}}\n' + entry.format("a*")
+    more = "So it seems to be in 1 more of the 3 cameras."
+    assert (more in load_scene(make_tree(tmp_path, both + reference)).remarks) == bool(said)
+
+
 def test_a_list_of_queries_and_their_own_gravity(tmp_path):
     gravity = "[gravity]\nmap = [0, 0, -1]\ncamera = [0, 2, 0]\n"
     scene = load_scene(make_tree(tmp_path, CAMERA + POSED + gravity, head='images = ["queries/b.png"]'))

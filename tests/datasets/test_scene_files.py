@@ -112,6 +112,17 @@ EITHER = {
     "unknown key": ("colour = 1", "unknown key 'colour'"),
     "unknown camera key": ("[camera]fov = 90", "'fov'", "unknown"),
 }
+
+
+def test_exchanged_coordinates_of_a_principal_point_are_told(tmp_path):
+    lens = 'model = "eucm"\nwidth = 200\nheight = 100\nfx = 60\nfy = 60\ncx = {}\ncy = {}\nalpha = 0.5\nbeta = 1\n'
+    panorama = 'model = "equirectangular"\nwidth = 200\nheight = 100\n'
+    for place, told in (((50, 100), 1), ((100, 50), 0)):
+        problem = load_scene(write_measured(tmp_path, MEASURED.replace(panorama, lens.format(*place)))).problem()
+        assert len(problem.remarks) == told
+    assert load_scene(write_measured(tmp_path)).problem().remarks == ()
+
+
 SCENES = {"synthetic": SYNTHETIC, "measured": MEASURED}
 
 

@@ -28,6 +28,7 @@ from spherloc.errors import SpherlocError
 from spherloc.experiments import read_results
 from spherloc.experiments.kept_results import kept_results
 from spherloc.experiments.sequence import inputs_of, localize
+from spherloc.experiments.summary import summarize
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.scene_files import MODEL, SCENE
 from spherloc.trajectory import read_tum
@@ -40,8 +41,13 @@ from spherloc_viz.commands.bundled import all_scenes, one_kind
 from spherloc_viz.commands.image_commands import _results_name
 from spherloc_viz.commands.localize import Solving, compare_sequences, localize_in_maps, localize_sequence
 from spherloc_viz.commands.run import Records
+from spherloc_viz.commands.sequence_text import sequence_text
 from spherloc_viz.plots.trajectories import backdrop_of, trajectory_png
 from spherloc_viz.recording.content.data import read_recording
+from spherloc_viz.recording.index.query import RunQuery
+from spherloc_viz.recording.index.run_index import RunIndex
+from spherloc_viz.recording.reviews import review_path
+from spherloc_viz.recording.storage.store import LOG_NAME
 from tests.cli_process import spherloc_here
 from tests.waiting import LIMIT_S
 
@@ -441,7 +447,41 @@ def test_what_other_queries_say_is_written_and_told(
     assert said_of("image1.png", results.rows[1], "m").endswith(why) and not results.rows[0].doubts
     loaded = load_scene(scene)
     assert isinstance(loaded, MapScene) and f"image1.png is doubtful: {why}" in sequence_html(results.rows, loaded)
+    aligned = replace(loaded, truth_source="mocap0, aligned with the map")
+    assert "The true poses are those of mocap0, aligned with the map." in sequence_html(results.rows, aligned)
+    assert "  the true poses are those of mocap0, al" in sequence_text(results, summarize(results), aligned)
+    assert "true poses" not in sequence_text(results, summarize(results), loaded)
     assert compare_sequences({scene: [Solving("mc", (), tmp_path / "mc", None)]}, 0, (), False, tmp_path) == 0
+
+
+@pytest.mark.usefixtures("drawn")
+def test_a_query_that_is_tried_anew_keeps_one_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That which the table names; one that somebody labelled stays, and the command says so."""
+    scene, out = write_scene(tmp_path, queries=2), tmp_path / "out"
+    records = Records(out / "recordings")
+
+    def judged(scene, rows, how, report, say):
+        trace = next(trace for _, trace in localize(scene, scene.queries[1:], *how[:3]))
+        yield replace(rows[1], inliers=rows[1].inliers - 1), trace
+
+    assert run(scene, out, estimator="mc", records=records) == 0
+    first = read_results(out).recordings
+    monkeypatch.setattr("spherloc_viz.commands.localize.judged_together", judged)
+    assert run(scene, out, estimator="mc", records=records) == 0
+    second = read_results(out).recordings
+    assert second[0] == first[0] and second[1] != first[1]
+    assert set(records.folder.glob("*.rrd")) == set(second), "the first try is gone"
+    with RunIndex(records.folder, print) as index:
+        assert {row.file for row in index.find(RunQuery()).rows} == {path.name for path in second}
+    assert first[1].name in (records.folder / LOG_NAME).read_text()
+    review_path(second[1]).write_bytes(b"")
+    capsys.readouterr()
+    assert run(scene, out, estimator="mc", records=records) == 0
+    third = read_results(out).recordings
+    assert third[1] != second[1] and second[1].exists() and third[1].exists()
+    assert f"{second[1].name}: stays, although image1.png was tried anew" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("drawn")

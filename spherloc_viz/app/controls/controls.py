@@ -32,6 +32,7 @@ from spherloc_viz.app.panels.recordings_panel import RecordingsPage, RecordingsP
 from spherloc_viz.app.panels.sweep_runs_panel import SweepPanel
 from spherloc_viz.app.review.opened import Opened
 from spherloc_viz.app.review.reviewer import ReviewCard
+from spherloc_viz.app.said_together import SaidTogether
 from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.text import box
@@ -269,6 +270,14 @@ class Controls:
         All of them are answers, which ``hidden`` leaves out.
         """
         return () if hidden else self.compare.items(run.trace) + self.review.items(run) + self._trajectory(run)
+
+    def said_together(self, run: Run) -> SaidTogether | None:
+        """What the queries of the run's scene, judged by each other, say of this one; None if nothing."""
+        label = run.request.scene.scene
+        scene = self._catalog.map_scene(label)
+        if scene is None or not self.sequence.rows(label):
+            return None
+        return self.sequence.said_of(label, scene, run.request.scene.query, run.trace.cam_from_map)
 
     def draw(self, run: Run, diagnosis: Diagnosis | None, hidden: bool) -> None:
         """Show what belongs to the newest run; ``diagnosis`` is None until it is ready; ``hidden`` hides answers."""

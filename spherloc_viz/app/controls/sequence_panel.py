@@ -16,7 +16,9 @@ from spherloc.experiments.sequence import How, localize
 from spherloc.experiments.summary import success_rates
 from spherloc.mapping.joint_outcome import judged_together
 from spherloc.trace import Trace
+from spherloc.types import FloatArray
 from spherloc_viz.app.controls.query_strip import QueryStrip
+from spherloc_viz.app.said_together import SaidTogether, said_together
 from spherloc_viz.app.text import ramp_html, status_html, table_html
 from spherloc_viz.app.web.touch import Touches
 from spherloc_viz.layers.primitives import Table
@@ -111,6 +113,13 @@ class SequencePanel:
         with self._lock:
             return self._rows.get(label, ())
 
+    def said_of(self, label: str, scene: MapScene, query: str | None, pose: FloatArray | None) -> SaidTogether | None:
+        """What the results of a scene's queries say of one whose run by itself has this ``pose`` (3, 4), by default of
+        the first one; None if nothing."""
+        name = scene.query(query).name
+        row = next((row for row in self.rows(label) if row.query == name), None)
+        return None if row is None else said_together(row, pose, scene.thresholds[0])
+
     def close(self) -> None:
         """End after the query at hand; does not wait."""
         self._strip.close()
@@ -165,8 +174,8 @@ class SequencePanel:
 
 
 def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
-    """How far the sequence is, how many succeed within each limit, what the colours of the dots mean, and why queries
-    are doubted that are localized by themselves."""
+    """How far the sequence is, how many succeed within each limit, what the colours of the dots mean, what the truth is
+    from, and why queries are doubted that are localized by themselves."""
     rates, unit = success_rates(rows, scene.thresholds), "m" if scene.metric else "units"
     lines = [
         (f"within {rate.degrees:g}° and {rate.metres:g} {unit}", f"{rate.successes} of {rate.judged}") for rate in rates
@@ -179,8 +188,9 @@ def sequence_html(rows: tuple[QueryResult, ...], scene: MapScene) -> str:
     worst = f"{scale * error_scale(np.array(errors), limit_m):.2g} {small}; red beyond {limit_m:g} {unit}"
     doubts = [f"{row.query} is doubtful: {why}" for row in rows for why in row.doubts]
     more = [f"And {len(doubts) - MAX_DOUBTS} more are."] if len(doubts) > MAX_DOUBTS else []
+    truth = [scene.about_truth] if rates and scene.about_truth else []
     return (
         table_html(Table("sequence", ("", ""), (done, located, *lines)))
         + (ramp_html("0", worst) if errors else "")
-        + "".join(status_html(sentence) for sentence in (*doubts[:MAX_DOUBTS], *more))
+        + "".join(status_html(sentence) for sentence in (*truth, *doubts[:MAX_DOUBTS], *more))
     )

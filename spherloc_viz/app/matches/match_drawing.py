@@ -153,7 +153,7 @@ def rings(places: FloatArray, numbers: Sequence[int]) -> list[str]:
             look = f'fill="none" stroke="{paint}" stroke-width="{width_px}" vector-effect="non-scaling-stroke"'
             parts.append(shapes.dot(x, y, RING, look))
         if len(numbers) <= MAX_LABELS:
-            # Beside the ring, on the side where there is more room, and within the drawing.
+            # ToldBeside the ring, on the side where there is more room, and within the drawing.
             left = x > 0.5 * WIDTH
             parts.append(
                 f'<text x="{x + (-1.4 if left else 1.4) * RING:.0f}" y="{max(y + 15.0, 40.0):.0f}" font-size="42" '

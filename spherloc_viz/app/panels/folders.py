@@ -5,7 +5,7 @@ A page names a file by the number of an allowed folder and a relative path; both
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -34,7 +34,7 @@ class Row:
     place: str
     """What names it to ``Roots.find``."""
     about: str = ""
-    """Kind and name of a scene, or what is wrong with it."""
+    """Kind and name of a scene, or what is wrong with it; of a folder whether it is one of a recorded sequence."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,16 @@ class Roots:
         sequence = None if photographs or outside else self._sequence(folder)
         counts = images_in_folders(folder, folders, MAX_FOLDERS) if sequence is None else images_of_cameras(sequence)
         at, recorded = self.place(folder) or "", sequence is not None
+        if not recorded:
+            rows = tuple(self._with_sequence(folder, row) for row in rows)
         return Listing(folder, at, above, rows, page, pages, remarks, photographs, counts, recorded)
+
+    def _with_sequence(self, folder: Path, row: Row) -> Row:
+        """A row of a folder, which says so if it is one of a recorded sequence."""
+        sequence = self._sequence(folder / row.name) if row.kind == "folder" else None
+        if sequence is None:
+            return row
+        return replace(row, about=f"a recorded sequence of {and_words(sorted(sequence.cameras))}")
 
     def _sequence(self, folder: Path) -> AslSequence | None:
         """The sequence in the ASL layout that a folder is, if all of its cameras are below the roots."""
@@ -150,6 +159,12 @@ class Roots:
         found.sort(key=lambda item: (item[0], item[1].casefold(), item[1]))
         remarks = tuple(_remarks(hidden, outside, whole))
         return [(path, place) for _, _, path, place in found], remarks, photographs, outside
+
+
+def and_words(words: Sequence[str]) -> str:
+    """One word or more: "cam0, cam1 and cam2"."""
+    *others, last = words
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def _remarks(hidden: int, outside: int, whole: bool) -> Iterator[str]:

@@ -14,10 +14,10 @@ from spherloc.disk_cache import cache_folder, store
 from spherloc.errors import InputError
 from spherloc.files import is_file
 from spherloc.mapping.advice import for_a_page
-from spherloc.mapping.new_queries import add_new_images, map_images
+from spherloc.mapping.new_queries import add_new_images, map_images, map_size
 from spherloc.mapping.photographs import MIN_IMAGES
 from spherloc.mapping.scene_files import MAP_FOLDER, SCENE
-from spherloc_viz.app.panels.folders import Listing, Roots, Row, describe
+from spherloc_viz.app.panels.folders import Listing, Roots, Row, and_words, describe
 from spherloc_viz.app.panels.map_panel import MapPanel
 from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_CALIBRATION_BYTES, File, Scratch, UploadForm, open_upload
 from spherloc_viz.app.text import DIM, begun, box, status_html
@@ -41,6 +41,8 @@ RULE = "border-top:1px solid rgba(128,140,160,.22)"
 
 AGAIN_ABOUT = "What was done is kept: with another Scale it takes some seconds. It opens when it is done."
 NEW_ABOUT = "The first is localized at once; the others are under Sequence in the tab Play."
+ITS_MAP = "its map"
+"""What the map at hand is called where the sequence is listed whose images it has."""
 ONE_ABOUT = "It is localized at once."
 
 
@@ -75,7 +77,8 @@ def _folder_html(listing: Listing, in_map: str, made: bool) -> str:
     rows = [_row_html(above, "↑ up" if listing.parent else "↑ all folders", "")]
     if in_map and (count := listing.photographs or sum(listing.in_folders.values())):
         these, about = ("this photograph", ONE_ABOUT) if count == 1 else (f"these {count:,} photographs", NEW_ABOUT)
-        these = "images of this sequence" if listing.sequence else these
+        if listing.sequence:
+            these = "other images of this sequence" if in_map == ITS_MAP else "images of this sequence"
         rows.append(_row_html(f"localize-folder:{listing.place}", f"Localize {these} in {in_map}", about))
     if title := _map_title(listing):
         new_about = SEQUENCE_ABOUT if listing.sequence else MAP_ABOUT
@@ -83,7 +86,7 @@ def _folder_html(listing: Listing, in_map: str, made: bool) -> str:
         rows.append(_row_html(f"map-folder:{listing.place}", title, about))
     for row in listing.rows:
         if row.kind == "folder":
-            rows.append(_row_html(f"open-folder:0:{row.place}", f"{row.name}/", ""))
+            rows.append(_row_html(f"open-folder:0:{row.place}", f"{row.name}/", row.about))
         else:
             rows.append(_scene_html(row))
     if not listing.rows and not listing.photographs:
@@ -106,13 +109,12 @@ def _map_title(listing: Listing) -> str:
     inside = sum(listing.in_folders.values())
     if inside < MIN_IMAGES:
         return ""
-    *others, last = sorted(listing.in_folders)
+    names = sorted(listing.in_folders)
     if listing.sequence:
-        cameras = f"{', '.join(others)} and {last}" if others else last
-        return f"Make a map of this sequence of {cameras}, {inside:,} images"
-    folders = f"the folders {', '.join(others)} and {last}" if others else f"the folder {last}"
-    if len(others) > MAX_NAMED:
-        folders = f"{len(others) + 1} folders"
+        return f"Make a map of this sequence of {and_words(names)}, {inside:,} images"
+    folders = f"the folder{'s' if len(names) > 1 else ''} {and_words(names)}"
+    if len(names) > MAX_NAMED + 1:
+        folders = f"{len(names)} folders"
     return f"Make a map of the {inside:,} photographs in {folders}"
 
 
@@ -310,12 +312,15 @@ class OpenPanel:
         self._say(" ".join(remarks))
 
     def _map_for(self, listing: Listing) -> str:
-        """The name of the map at hand, if other photographs than its own are listed; else empty."""
+        """What the map at hand is called, if other photographs than its own are listed, or a sequence most of whose
+        images are not in it; else empty."""
         scene = self._at_hand()
         try:
             images = None if self._place(scene) is None else map_images(scene)
             # Of the folder above it, the map's own photographs would be localized too.
             own = images is not None and images.resolve().is_relative_to(listing.folder.resolve())
+            if images is not None and listing.sequence and images.resolve() == listing.folder.resolve():
+                return ITS_MAP if sum(listing.in_folders.values()) >= 2 * map_size(scene) else ""
         except (InputError, OSError, RuntimeError):
             return ""
         return "" if images is None or own else f"the map of {images.name}"

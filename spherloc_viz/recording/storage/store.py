@@ -313,6 +313,20 @@ class RecordingStore:
                 self.prune()
         return path
 
+    def delete(self, path: Path) -> bool:
+        """Delete a recording of this folder, whose run was made anew; returns whether it is gone.
+
+        One with labels or a note stays, as one that is not listed does. What is deleted is first written into
+        ``pruned.log``. Raises ``RecordingError`` if the index or the log cannot be used.
+        """
+        row = self.index.get(path.name) if path.parent.resolve() == self.folder.resolve() else None
+        if row is not None and not (row.labels or row.note or row.title):
+            _delete(path, row)
+        gone = not path.exists()
+        if gone and row is not None:
+            self.index.remove(row.file)
+        return gone
+
     def prune(self) -> None:
         """Delete the oldest successes beyond the size that may be kept, and say so.
 
