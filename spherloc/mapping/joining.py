@@ -24,9 +24,10 @@ from spherloc.mapping.pair_evidence import PairEvidence, VerifiedPair
 from spherloc.mapping.parallel import Tell
 from spherloc.types import FloatArray
 
-MIN_RADIUS_DEG, MOST = 76.0, 0.6
+MIN_RADIUS_DEG, MOST, MIN_FITTING = 65.0, 0.6, 20
 """Two maps are not joined if what fits between them is within a smaller part of the view (``Between.radius_deg``), as
-of one thing that stands at two places, unless it is the second share of the matches of the pair that joins them."""
+of one thing that stands at two places, unless it is the second share of the matches of the pair that joins them; nor if
+fewer matches fit."""
 MAX_WORK = 1000
 """Joins are tried until the maps that were made for that have so many images together."""
 
@@ -37,9 +38,15 @@ def joined_by_pairs(models: Sequence[Reconstruction], matched: Matched, tell: Te
     if len(models) == 1 and len(placed) == len(matched.ids):
         return tuple(models)
     found = _best(_JoinSearch(models, matched.ids.keys() - placed, PairEvidence(matched), tell))
-    counts = models[0].all_matches
-    made = [replace(one, all_matches=np.maximum(one.all_matches, counts)) for one in found.models]
+    before = {frozenset(one.poses): one for one in models}
+    made = [before.get(frozenset(one.poses)) or _with_counts(one, models[0].all_matches) for one in found.models]
     return tuple(sorted(made, key=lambda one: -len(one.poses)))
+
+
+def _with_counts(made: Reconstruction, every: NDArray[np.int64]) -> Reconstruction:
+    """A joined model with the matches (V, V) of the other images, too."""
+    outside = [name not in made.poses for name in made.ids]
+    return replace(made, all_matches=np.where(np.logical_or.outer(outside, outside), every, made.all_matches))
 
 
 def _best(search: "_JoinSearch") -> "_Result":
@@ -121,7 +128,8 @@ class _JoinSearch:
         between = self._evidence.between(joint.poses, moved.poses, whole.poses)
         joint = replace(joint, all_matches=between.added_to(_counts(whole, other), whole.ids)).judged()
         if not set(joint.contradictions) - _contradictions(whole, other):
-            self._known[state] = joint
+            joints = (*whole.joints, pair.names, *other.joints) if other is not None else whole.joints
+            self._known[state] = replace(joint, joints=joints)
         return self._known[state]
 
     def _moved(self, whole: Reconstruction, other: Reconstruction | None, pair: VerifiedPair) -> "_Moved | None":
@@ -158,6 +166,8 @@ class _JoinSearch:
         poses = {**whole.poses, **moved.poses}
         between = self._evidence.between(poses, moved.poses, whole.poses)
         if between.radius_deg < MIN_RADIUS_DEG and self._evidence.share(pair) < MOST:
+            return False
+        if sum(between.counts.values()) < MIN_FITTING:
             return False
         counts = between.added_to(_counts(whole, other), whole.ids)
         points = {**points_of(whole.model), **moved.points}

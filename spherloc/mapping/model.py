@@ -78,6 +78,8 @@ class Reconstruction:
     """Ids of all images in the database, by name."""
     joined: bool = False
     """Whether maps of single cameras were joined by the images that these took together (``rig``)."""
+    joints: tuple[tuple[str, str], ...] = ()
+    """Names of the pairs of images each of which alone joins two parts of the model (``joining``)."""
 
     def without(self, names: Collection[str]) -> "Reconstruction":
         """The model without the images ``names``, and without points that fewer than two of the other images see."""

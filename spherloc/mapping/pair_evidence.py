@@ -6,14 +6,14 @@ counted by all matches between them, right or wrong: the two-view check leaves o
 through a door.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.consensus.spread import joined, spread_of
+from spherloc.consensus.spread import spread_of
 from spherloc.geometry import transform
 from spherloc.mapping.level_pairs import chance_of_fit, fitting
 from spherloc.mapping.matched import Matched, Names
@@ -86,25 +86,24 @@ class PairEvidence:
 
     def between(self, poses: Mapping[str, FloatArray], some: Collection[str], others: Collection[str]) -> "Between":
         """How the matches between two sets of images fit their poses (3, 4)."""
-        counts = dict[Names, int]()
-        seen, fit = dict[str, list[FloatArray]](), dict[str, list[BoolArray]]()
+        counts, fit = dict[Names, int](), dict[str, list[FloatArray]]()
         for pair in product(some, others):
-            if len(self._rays(*pair)[0]) >= MIN_MATCHES and pair[0] != pair[1]:
-                count, fits = self._fit(poses, pair)
-                counts[pair] = count
-                for name, rays in zip(pair, self._rays(*pair), strict=True):
-                    seen.setdefault(name, []).append(rays)
-                    fit.setdefault(name, []).append(fits)
-        radii = [0.0]
-        for side in (some, others):
-            spreads = [
-                spread_of(self._cameras[name], np.concatenate(seen[name]), np.concatenate(fit[name]))
-                for name in side
-                if name in seen
-            ]
-            if known := [spread for spread in spreads if spread is not None]:
-                radii.append(joined(known).radius_deg)
-        return Between(counts, max(radii))
+            rays = self._rays(*pair)
+            if len(rays[0]) >= MIN_MATCHES and pair[0] != pair[1]:
+                counts[pair], fits = self._fit(poses, pair)
+                for name, seen in zip(pair, rays, strict=True):
+                    fit.setdefault(name, []).append(seen[fits if counts[pair] else []])
+        return Between(counts, max(self._radius_deg(fit, some), self._radius_deg(fit, others)))
+
+    def _radius_deg(self, fit: Mapping[str, Sequence[FloatArray]], names: Collection[str]) -> float:
+        """Mean radius of the part of the view in which what fits lies, over those of the images; 0 if nothing fits."""
+        found = []
+        for name in names:
+            rays = np.concatenate(fit.get(name, [np.empty((0, 3))]))
+            spread = spread_of(self._cameras[name], rays, np.ones(len(rays), np.bool_))
+            if spread is not None:
+                found.append(spread.radius_deg)
+        return float(np.mean(found)) if found else 0.0
 
     def _rays(self, first: str, second: str) -> tuple[FloatArray, FloatArray]:
         """Bearings (M, 3) of the matches of two images in both."""

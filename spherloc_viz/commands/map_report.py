@@ -82,8 +82,15 @@ def summary(made: Map, found: Photographs) -> list[str]:
 
 
 def _joined_words(made: Map, found: Photographs) -> list[str]:
-    """Which maps of single cameras were joined; none if they were not."""
-    return [words(made.written.poses, shots_of(found.views))] if made.made.joined else []
+    """Which maps of single cameras were joined, and which parts of the map by a single pair of images."""
+    poses = made.written.poses
+    said = [words(poses, shots_of(found.views))] if made.made.joined else []
+    said += [
+        f"two parts, by {first} and {second} alone: images in between would make that surer"
+        for first, second in made.made.joints
+        if first in poses and second in poses
+    ]
+    return said
 
 
 def _opposed_words(first: str, second: str) -> str:
