@@ -24,10 +24,12 @@ from spherloc.mapping.pair_evidence import PairEvidence, VerifiedPair
 from spherloc.mapping.parallel import Tell
 from spherloc.types import FloatArray
 
-MIN_RADIUS_DEG, MOST, MIN_FITTING = 65.0, 0.6, 20
-"""Two maps are not joined if what fits between them is within a smaller part of the view (``Between.radius_deg``), as
-of one thing that stands at two places, unless it is the second share of the matches of the pair that joins them; nor if
-fewer matches fit."""
+MIN_FITTING, LEAST, MOST = 20, 0.3, 0.6
+"""Two maps are joined if so many matches between them fit, and the second share of those of the pair that joins them.
+From the third share on it does not matter where in the view they lie."""
+MIN_RADIUS_DEG, MIN_RADIUS_ONE_THING_DEG = 65.0, 80.0
+"""Else they must not lie within a smaller part of it (``Between.radius_deg``), as those of one thing that stands at two
+places do; the second if the pair was taken for such a thing."""
 MAX_WORK = 1000
 """Joins are tried until the maps that were made for that have so many images together."""
 
@@ -165,9 +167,11 @@ class _JoinSearch:
         """Whether two models may be joined, as far as can be told before poses and points are adjusted."""
         poses = {**whole.poses, **moved.poses}
         between = self._evidence.between(poses, moved.poses, whole.poses)
-        if between.radius_deg < MIN_RADIUS_DEG and self._evidence.share(pair) < MOST:
+        share = self._evidence.share(pair)
+        if sum(between.counts.values()) < MIN_FITTING or share < LEAST:
             return False
-        if sum(between.counts.values()) < MIN_FITTING:
+        radius_deg = MIN_RADIUS_ONE_THING_DEG if pair.one_thing else MIN_RADIUS_DEG
+        if share < MOST and between.radius_deg < radius_deg:
             return False
         counts = between.added_to(_counts(whole, other), whole.ids)
         points = {**points_of(whole.model), **moved.points}

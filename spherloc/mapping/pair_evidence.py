@@ -42,11 +42,15 @@ class VerifiedPair:
     """Unit vector (3,) in the second camera's frame: the translation without its length."""
     matches: NDArray[np.int64]
     """(M, 2) indices of the features of both images that fit."""
+    one_thing: bool
+    """Whether the two-view check took it for one thing that may stand at two places."""
 
     def turned_round(self) -> "VerifiedPair":
         """The same with the second image as the first."""
         rotation = self.rotation.T
-        return VerifiedPair((self.names[1], self.names[0]), rotation, -rotation @ self.direction, self.matches[:, ::-1])
+        return VerifiedPair(
+            (self.names[1], self.names[0]), rotation, -rotation @ self.direction, self.matches[:, ::-1], self.one_thing
+        )
 
 
 class PairEvidence:
@@ -56,8 +60,11 @@ class PairEvidence:
         """Read the matches of all pairs from the database."""
         names = matched.names
         self.pairs = [
-            VerifiedPair((names[one], names[other]), *relative(found), np.asarray(found.inlier_matches, np.int64))
-            for (one, other), found in {**matched.one_thing, **matched.verified}.items()
+            VerifiedPair(
+                (names[one], names[other]), *relative(found), np.asarray(found.inlier_matches, np.int64), one_thing
+            )
+            for one_thing, pairs in ((True, matched.one_thing), (False, matched.verified))
+            for (one, other), found in pairs.items()
         ]
         self._bearings, self._cameras = matched.bearings, matched.cameras
         self._matches, self._bound_rad = matched.matches(), matched.bound_rad
