@@ -148,6 +148,7 @@ def test_two_rooms_are_joined_by_the_picture_in_the_door(rooms):
     scale = apart.sum() / true_apart.sum()
     np.testing.assert_allclose(apart / scale, true_apart, atol=0.02)  # metres
     assert whole.contradictions == ()
+    assert [set(pair) for pair in whole.joints] == [{"door.png", "b0.png"}], "the only pair between the rooms"
 
 
 def test_two_rooms_without_a_picture_between_them_stay_apart(rooms):
