@@ -34,12 +34,14 @@ MAX_WORK = 1000
 """Joins are tried until the maps that were made for that have so many images together."""
 
 
-def joined_by_pairs(models: Sequence[Reconstruction], matched: Matched, tell: Tell) -> tuple[Reconstruction, ...]:
+def joined_by_pairs(
+    models: Sequence[Reconstruction], matched: Matched, evidence: PairEvidence, tell: Tell
+) -> tuple[Reconstruction, ...]:
     """Models of which some are joined with each other or with images that are in none, the largest first."""
     placed = {name for one in models for name in one.poses}
     if len(models) == 1 and len(placed) == len(matched.ids):
         return tuple(models)
-    found = _best(_JoinSearch(models, matched.ids.keys() - placed, PairEvidence(matched), tell))
+    found = _best(_JoinSearch(models, matched.ids.keys() - placed, evidence, tell))
     before = {frozenset(one.poses): one for one in models}
     made = [before.get(frozenset(one.poses)) or _with_counts(one, models[0].all_matches) for one in found.models]
     return tuple(sorted(made, key=lambda one: -len(one.poses)))
@@ -129,7 +131,8 @@ class _JoinSearch:
         joint = with_images(replace(whole, model=copy.deepcopy(whole.model)), moved.poses)
         between = self._evidence.between(joint.poses, moved.poses, whole.poses)
         joint = replace(joint, all_matches=between.added_to(_counts(whole, other), whole.ids)).judged()
-        if not set(joint.contradictions) - _contradictions(whole, other):
+        against = {*joint.contradictions, *self._evidence.misplaced(joint.poses)}
+        if not against - _contradictions(whole, other):
             joints = (*whole.joints, pair.names, *other.joints) if other is not None else whole.joints
             self._known[state] = replace(joint, joints=joints)
         return self._known[state]

@@ -109,21 +109,25 @@ class Reconstruction:
         return np.linalg.norm(self.points() - np.reshape(seen_from, (-1, 3)), axis=1)
 
 
-def parted(made: Reconstruction) -> list[Reconstruction]:
+def parted(made: Reconstruction, misplaced: Collection[tuple[str, str]] = ()) -> list[Reconstruction]:
     """The model cut until no two images contradict each other: parts of two images or more, the largest first.
+
+    Pairs whose matches do not fit the poses at all, the ``misplaced``, contradict, too, and hold no parts together.
 
     A contradiction says that two images do not belong next to each other, so somewhere between them the model takes two
     similar places for one. The cut that separates the two images with the fewest matches is made there; matches count
     less where the two images see little of what both should see.
     """
-    if not made.contradictions:
+    against = {*map(_sorted, made.contradictions), *map(_sorted, misplaced)}
+    if not against:
         return [made]
     place = {name: index for index, name in enumerate(made.ids)}
     points, panoramas = points_of(made.model), panoramas_of(made.model)
     graph = nx.Graph()
     graph.add_nodes_from(made.poses)
     for pair in combinations(made.poses, 2):
-        if matches := int(made.all_matches[place[pair[0]], place[pair[1]]]):
+        matches = int(made.all_matches[place[pair[0]], place[pair[1]]])
+        if matches and pair not in misplaced and pair[::-1] not in misplaced:
             share = 1.0
             if panoramas.issuperset(pair):
                 alike, both = _seen_alike(made.poses, points, pair)
@@ -131,7 +135,7 @@ def parted(made: Reconstruction) -> list[Reconstruction]:
             graph.add_edge(*pair, capacity=round(100 * matches * share))
     if (alone := _contradicted_end(graph, made.contradictions)) is not None:
         return parted(made.without({alone}).judged())
-    cuts = [nx.minimum_cut(graph, *pair) for pair in sorted(set(map(_sorted, made.contradictions)))]
+    cuts = [nx.minimum_cut(graph, *pair) for pair in sorted(against)]
     _, (first, second) = min(cuts, key=lambda cut: cut[0])
     parts = []
     for side in (first, second):

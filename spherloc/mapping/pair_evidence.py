@@ -27,6 +27,9 @@ WINDOW = 0.1
 """Two distances agree if their logarithms differ by no more than that."""
 MIN_AGREEING, MIN_SHARE, CLEARLY = 6, 1.0 / 3.0, 2.0
 """A distance is taken if so many matches agree on it, that share of all, and so many times as many as on any other."""
+OWN, HARDLY, MIN_TELLING = 0.6, 0.08, 60
+"""Two images are misplaced in a map if the first share of their matches, and so many, fit their own pose, and no more
+than the second share that in the map. A wrong pair seldom has so large a share."""
 MIN_MATCHES, SIGMAS = 8, 3.0
 """So many matches of two images are counted, if more of them fit than chance explains, by so many of its deviations."""
 
@@ -68,6 +71,13 @@ class PairEvidence:
         ]
         self._bearings, self._cameras = matched.bearings, matched.cameras
         self._matches, self._bound_rad = matched.matches(), matched.bound_rad
+        self._telling = [
+            pair
+            for pair in self.pairs
+            if not pair.one_thing
+            and self.share(pair) >= OWN
+            and self.share(pair) * len(self._rays(*pair.names)[0]) >= MIN_TELLING
+        ]
 
     def strength(self, pair: VerifiedPair) -> float:
         """Number of matches of a pair that fit its own pose, times their share of all."""
@@ -78,6 +88,12 @@ class PairEvidence:
         first, second = pair.names
         rays, others = self._rays(first, second)
         return float(np.mean(fitting(rays, others, pair.rotation, pair.direction, self._bound_rad)))
+
+    def misplaced(self, poses: Mapping[str, FloatArray]) -> set[Names]:
+        """Pairs of which most matches fit their own pose, and hardly any the poses (3, 4) in a map: one of the two
+        images stands elsewhere."""
+        inside = [pair.names for pair in self._telling if set(pair.names) <= poses.keys()]
+        return {names for names in inside if np.mean(self._fit(poses, names)[1]) <= HARDLY}
 
     def distance(self, made: Reconstruction, pair: VerifiedPair) -> float | None:
         """The distance between the images of a pair, in the units of a model that has the first; None if its points do

@@ -32,6 +32,7 @@ from spherloc.mapping.later import with_images
 from spherloc.mapping.matched import Matched, Names, match_all
 from spherloc.mapping.misplaced import fits, without_misplaced
 from spherloc.mapping.model import Reconstruction, parted, registered, untangled, worth
+from spherloc.mapping.pair_evidence import PairEvidence
 from spherloc.mapping.pairs import MIN_MATCHES
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.rig import Shots, joint_of, one_camera, shots_of, went_apart, with_ties
@@ -80,14 +81,14 @@ def reconstruct(
     if rigid:
         counts = matched.counts()
         left = replace(left, same_place=with_ties(counts + matched.same_place, matched.names, shots) - counts)
-    made = [rigid]
+    made, evidence = [rigid], PairEvidence(matched) if panoramas else None
     for _ in range(ROUNDS):
         cut = set[Names]()
         for keep in (0.0, STRONG):
-            models, apart = _models_of(pycolmap, left, left.counts(), keep, tell)
+            models, apart = _models_of(pycolmap, left, left.counts(), keep, tell, evidence)
             made.append(models)
             cut |= apart
-        if not cut or not panoramas:
+        if not cut or evidence is None:
             break
         left = left.without(cut)
     candidates = [models for models in made if models]
@@ -100,7 +101,7 @@ def reconstruct(
         )
     # Most images in all, then in one map, then those by strong pairs.
     best = max(reversed(candidates), key=lambda models: (sum(map(worth, models)), worth(models[0])))
-    return joined_by_pairs(best, matched, tell) if panoramas else best
+    return best if evidence is None else joined_by_pairs(best, matched, evidence, tell)
 
 
 def _rigid(
@@ -118,12 +119,18 @@ def _rigid(
 
 
 def _models_of(
-    pycolmap: Any, matched: Matched, counts: NDArray[np.int64], keep: float, tell: Tell
+    pycolmap: Any,
+    matched: Matched,
+    counts: NDArray[np.int64],
+    keep: float,
+    tell: Tell,
+    evidence: PairEvidence | None = None,
 ) -> tuple[tuple[Reconstruction, ...], set[Names]]:
     """Models, the largest first, of the pairs with at least the share ``keep`` of the matches of either image's best
     pair, and the pairs that joined what contradictions showed to be apart.
 
-    ``counts`` (V, V) are the numbers of matches of the pairs that may be used.
+    ``counts`` (V, V) are the numbers of matches of the pairs that may be used. With ``evidence``, models are cut, too,
+    where images stand elsewhere than their pair says.
     """
     ids = list(matched.ids.values())
     with TemporaryDirectory() as folder:  # COLMAP uses all pairs of a database, and writes its models into a folder
@@ -148,11 +155,21 @@ def _models_of(
             Reconstruction(model, poses, counts, (), every, matched.database, matched.ids), agreeing
         )
         if len(whole.poses) > 1:
-            whole = whole.judged()
-            parts = parted(whole)
-            cut |= _cut(whole, parts, rotations)
+            parts, misplaced = _parts(whole.judged(), evidence)
+            cut |= _cut(whole, parts, {pair: one for pair, one in rotations.items() if pair not in misplaced})
             found += parts
     return untangled(found), cut
+
+
+def _parts(whole: Reconstruction, evidence: PairEvidence | None) -> tuple[list[Reconstruction], set[Names]]:
+    """The parts of a model that do not contradict themselves, and the pairs that say that images stand elsewhere."""
+    misplaced = set[Names]() if evidence is None else evidence.misplaced(whole.poses)
+    parts = parted(whole, misplaced)
+    if misplaced:
+        further = [_parts(part, evidence) for part in parts]
+        parts = [part for found, _ in further for part in found]
+        misplaced = misplaced.union(*(more for _, more in further))
+    return parts, misplaced
 
 
 def _cut(whole: Reconstruction, parts: Sequence[Reconstruction], rotations: Mapping[Names, FloatArray]) -> set[Names]:

@@ -11,7 +11,7 @@ from spherloc.geometry import camera_centre, pose, so3_exp, transform, yaw_rotat
 from spherloc.mapping.joining import joined_by_pairs
 from spherloc.mapping.matched import Matched, _camera_in
 from spherloc.mapping.model import Reconstruction
-from spherloc.mapping.pair_evidence import distance_of
+from spherloc.mapping.pair_evidence import PairEvidence, distance_of
 from tests.mapping.test_rig import in_another_frame
 
 PANORAMA = Equirectangular(1000, 500)
@@ -134,7 +134,7 @@ def rooms(tmp_path, rng) -> Rooms:
 def join(rooms: Rooms, without: tuple[str, ...] = ()) -> list[list[str]]:
     matched = rooms.matched(without)
     models = [rooms.model_of("a", 1.0, np.eye(3)), rooms.model_of("b", 0.4, so3_exp(np.array([0.1, 2.0, 0.2])))]
-    rooms.made = joined_by_pairs(models, matched, lambda *_: None)
+    rooms.made = joined_by_pairs(models, matched, PairEvidence(matched), lambda *_: None)
     return [sorted(one.poses) for one in rooms.made]
 
 
@@ -174,11 +174,23 @@ def test_rooms_that_look_alike_are_joined_where_nothing_contradicts(rooms):
     first, second = rooms.true["a2.png"], rooms.true["b1.png"]
     moved = pose(second[:, :3], second[:, 3] + second[:, :3] @ [8.0, 0.0, 0.0])
     turn = moved[:, :3] @ first[:, :3].T
-    rooms.add("a2.png", "b1.png", np.column_stack([every, every + 300]), pose(turn, moved[:, 3] - turn @ first[:, 3]))
+    relative = pose(turn, moved[:, 3] - turn @ first[:, 3])
+    rooms.add("a2.png", "b1.png", np.column_stack([every, every + 300]), relative, wrong=250)
     # The pair fits all around; but then the other photographs stand side by side, and do not match.
     assert [len(names) for names in join(rooms, ("door.png",))] == [4, 4]
     rooms.path.unlink()
     assert join(rooms) == [sorted(rooms.true)]
+
+
+def test_images_are_misplaced_if_most_of_their_matches_fit_elsewhere(rooms):
+    evidence = PairEvidence(rooms.matched())
+    assert evidence.misplaced(rooms.true) == set()
+    shift = pose(np.eye(3), np.array([4.2, 0.0, 0.0]))[:, 3]
+    wrong = {
+        name: pose(one[:, :3], one[:, 3] + one[:, :3] @ shift) if name.startswith("b") else one
+        for name, one in rooms.true.items()
+    }
+    assert evidence.misplaced(wrong) == {("b0.png", "door.png")}, "the only pair between what was moved and the rest"
 
 
 def test_the_distance_is_that_on_which_points_agree(rng):
