@@ -469,3 +469,21 @@ def test_what_becomes_of_a_run_is_told_when_it_is_known(tmp_path: Path) -> None:
     slow.ended(RecordingError("run.rrd: no room."))
     assert runs.finish(other, None) == ("run.rrd: no room.", None) and runs.path(other.trace) is None
     assert PageRuns(None, catalog).finish(run, None) == ("Runs are not recorded.", None)
+
+
+def test_a_query_that_is_tried_anew_keeps_one_recording(tmp_path: Path) -> None:
+    """The last one; that of another query, or of the same query in an earlier sequence, is not touched."""
+    told: list[Path | None] = []
+
+    class Counting:
+        def submit(self, trace: object, origin: object, *, instead_of: Path | None) -> Path:
+            told.append(instead_of)
+            return tmp_path / f"{len(told)}.rrd"
+
+    catalog = Catalog(write_tiny_scene(tmp_path))
+    runs = PageRuns(Counting(), catalog)  # type: ignore[arg-type]
+    trace = estimate(catalog.problem(SceneRequest("tiny", 1)), "mc", seed=1)
+    asked = [("a", False), ("b", False), ("a", True), ("a", False), ("a", True), ("c", True)]
+    for query, anew in asked:
+        runs.record(trace, SceneRequest("tiny", 1, query), anew)
+    assert told == [None, None, tmp_path / "1.rrd", None, tmp_path / "4.rrd", None]

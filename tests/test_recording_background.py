@@ -21,6 +21,7 @@ from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.index.query import RunQuery
 from spherloc_viz.recording.origin import Origin
+from spherloc_viz.recording.reviews import review_path
 from spherloc_viz.recording.storage import recorder as background
 from spherloc_viz.recording.storage.recorder import Recorder
 from spherloc_viz.recording.storage.store import RecordingStore, file_name
@@ -204,3 +205,19 @@ def test_threads_and_files_stay_few(trace: Trace, tmp_path: Path) -> None:
     # A pool of threads may start late; one thread a run, or one a recorder and run, would be many more.
     assert threads <= before[0] + 8 and files <= before[1] + 2
     assert len(list(tmp_path.glob("*.rrd"))) == 19
+
+
+def test_a_run_that_is_made_anew_takes_the_place_of_its_recording(trace: Trace, tmp_path: Path) -> None:
+    """Unless somebody has labelled that, which a notice tells."""
+    errors, notices = Told(), Told()
+    with Recorder(tmp_path, errors.hear, notices.hear) as recorder:
+        first = recorder.submit(trace)
+        second = recorder.submit(replace(trace, seed=12), instead_of=first)
+        until(lambda: recorder.waiting == 0)
+        assert not first.exists() and not notices
+        review_path(second).write_bytes(b"")
+        third = recorder.submit(replace(trace, seed=13), instead_of=second)
+        until(lambda: recorder.waiting == 0)
+        assert {row.file for row in recorder.index.find(RunQuery()).rows} == {second.name, third.name}
+    (notice,) = notices
+    assert notice.startswith(f"{second.name} stays, since it has labels") and third.name in notice and not errors

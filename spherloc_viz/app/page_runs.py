@@ -64,6 +64,8 @@ class PageRuns:
         self._recorder, self._catalog = recorder, catalog
         self._known: Known | None = None
         self._submitted: Submitted | None = None
+        self._queries: dict[tuple[str, str | None], Path] = {}
+        """The last recordings of the queries of sequences, by the scene's label and the query's name."""
 
     def expect(self, known: Known) -> None:
         """The page is about to repeat a recorded run, which is not to be recorded once more."""
@@ -118,10 +120,15 @@ class PageRuns:
         known, path = self._known, self.path(trace)
         return "" if path is None or (known is not None and path == known.path) else path.name
 
-    def record(self, trace: Trace, scene: SceneRequest) -> None:
-        """Record a query of a sequence that a panel localized, if runs are recorded; raises ``RecordingError``."""
+    def record(self, trace: Trace, scene: SceneRequest, anew: bool) -> None:
+        """Record a query of a sequence that a panel localized, if runs are recorded; raises ``RecordingError``.
+
+        One that is tried ``anew`` takes the place of that query's last recording, which is deleted once it is written.
+        """
         if self._recorder is not None:
-            self._recorder.submit(trace, self._origin("sequence", scene))
+            query = scene.scene, scene.query
+            before = self._queries.pop(query, None) if anew else None
+            self._queries[query] = self._recorder.submit(trace, self._origin("sequence", scene), instead_of=before)
 
     def path(self, trace: Trace) -> Path | None:
         """The recording of a run, if there is one."""

@@ -433,10 +433,10 @@ class Session:
         self._status.say(sentence, self._runs.keepable(run.trace), self._runs.untold(sentence))
         return pause
 
-    def record(self, trace: Trace, scene: SceneRequest) -> None:
-        """Record a run that a panel made, if runs are recorded."""
+    def record(self, trace: Trace, scene: SceneRequest, anew: bool) -> None:
+        """Record a run that a panel made, if runs are recorded; ``anew`` in the place of that before."""
         try:
-            self._runs.record(trace, scene)
+            self._runs.record(trace, scene, anew)
         except SpherlocError as error:
             self.complain(str(error))
 

@@ -159,7 +159,7 @@ class Owner(Protocol):
     def open_recorded(self, request: RunRequest, path: Path, cam_from_map: FloatArray | None) -> None:
         """Ask for a run that is recorded already, as ``path`` and with this pose (3, 4)."""
 
-    def record(self, trace: Trace, scene: SceneRequest) -> None:
+    def record(self, trace: Trace, scene: SceneRequest, anew: bool) -> None:
         """Record a run that a panel made of a scene."""
 
     def shown(self) -> Shown | None:
@@ -378,14 +378,14 @@ class Controls:
         request = self.scene.read_unchanged()
         self._owner.open(RunRequest(replace(request, query=name), *self.estimator.read()))
 
-    def _localized(self, trace: Trace | None) -> None:
-        """One more query of a sequence is done."""
+    def _localized(self, trace: Trace | None, anew: bool) -> None:
+        """One more query of a sequence is done, or one that was done before is tried anew."""
         request = self._sequence
         if trace is not None and request is not None:
             images = self._catalog.map_scene(request.scene)
             views = () if images is None else images.queries
             query = next((view.name for view in views if view.path == trace.problem.image), None)
-            self._owner.record(trace, replace(request, query=query))
+            self._owner.record(trace, replace(request, query=query), anew)
         self._owner.redraw()
 
     def _chosen_sweep(self) -> tuple[Path, SceneRequest]:

@@ -38,12 +38,12 @@ class SequencePanel:
         touches: Touches,
         folder: Path | None,
         chosen: Callable[[], tuple[str, MapScene, str, Any, int]],
-        done: Callable[[Trace | None], None],
+        done: Callable[[Trace | None, bool], None],
         open_query: Callable[[str], None],
     ) -> None:
         """``folder`` has the results of ``spherloc localize``, if there is one. ``chosen`` tells the scene's label, the
-        scene, estimator, options and seed; ``done`` is called for every query with its run, if it came so far;
-        ``open_query`` shows the query of that name."""
+        scene, estimator, options and seed; ``done`` is called for every query with its run, if it came so far, and
+        whether the query was run before and is tried anew; ``open_query`` shows the query of that name."""
         self._results, self._chosen, self._done = folder, chosen, done
         self._folder = gui.add_folder("Sequence", visible=False)
         with self._folder:
@@ -86,7 +86,7 @@ class SequencePanel:
         words = f"Localized before by {found.configuration.estimator}: {shorten(found.folder.name)}."
         self._text.content = sequence_html(found.rows, scene) + status_html(words)
         self._follow()
-        self._done(None)
+        self._done(None, False)
 
     def hide_answers(self, hidden: bool) -> None:
         """Hide the results, or show them again."""
@@ -148,7 +148,7 @@ class SequencePanel:
                 self._bar.value = 100.0 * len(rows) / len(scene.queries)
                 self._text.content = sequence_html(rows, scene)
                 self._follow()
-                self._done(trace)
+                self._done(trace, False)
                 if stop.is_set():
                     break
             else:
@@ -168,7 +168,7 @@ class SequencePanel:
                 self._rows[label] = rows
             self._text.content = sequence_html(rows, scene)
             self._follow()
-            self._done(trace)
+            self._done(trace, True)
             if stop.is_set():
                 break
 

@@ -28,7 +28,7 @@ Ended = Callable[[RecordingError | None], None]
 """Is told that a run is written, or why it is not."""
 Known = Callable[[Path], None]
 """Is told which recording has the very same run."""
-_Job = tuple[Trace, Path, Origin | None, Diagnosis | None, Ended, Known | None]
+_Job = tuple[Trace, Path, Origin | None, Diagnosis | None, Ended, Known | None, Path | None]
 
 
 class _StoppedError(Exception):
@@ -93,12 +93,14 @@ class Recorder:
         diagnosis: Diagnosis | None = None,
         ended: Ended = lambda error: None,
         known: Known | None = None,
+        instead_of: Path | None = None,
     ) -> Path:
         """Have a run recorded and return the path that its file will have. Never waits.
 
         A run without ``diagnosis`` is diagnosed in the background. ``ended`` is told in a thread of the recorder when
         the run is written and listed, or why it is not written. With ``known``, a run whose very same is recorded from
-        the same source is not written once more: ``known`` is told of that recording before ``ended``.
+        the same source is not written once more: ``known`` is told of that recording before ``ended``. A run
+        ``instead_of`` an earlier recording has that deleted, once it is written, unless it has labels or a note.
 
         Raises ``RecordingError`` if too many runs wait
         already, or after ``close``.
@@ -108,7 +110,7 @@ class Recorder:
             if self._closed:
                 raise RecordingError(f"{path.name}: not recorded, since recording has ended.")
             try:
-                self._queue.put_nowait((trace, path, origin, diagnosis, _safe(ended), known))
+                self._queue.put_nowait((trace, path, origin, diagnosis, _safe(ended), known, instead_of))
             except queue.Full:
                 raise RecordingError(
                     f"{path.name}: not recorded, since {QUEUE_LENGTH} runs wait to be recorded."
@@ -159,6 +161,7 @@ class Recorder:
         diagnosis: Diagnosis | None,
         ended: Ended,
         known: Known | None,
+        instead_of: Path | None,
     ) -> None:
         try:
             before = None if known is None or origin is None else self._store.known(trace, origin.source)
@@ -166,6 +169,7 @@ class Recorder:
                 known(before)
             else:
                 self._store.record(trace, origin, diagnosis, path)
+                self._replace(instead_of, path)
         except RecordingError as error:
             self._lose(error, ended)
         except Exception as error:  # a bug in drawing one run must not end the recording of the others
@@ -175,6 +179,16 @@ class Recorder:
             lost, self._lost = self._lost, 0
             if lost:
                 self._on_recovery(f"Runs are recorded again; {lost} {'was' if lost == 1 else 'were'} not.")
+
+    def _replace(self, before: Path | None, path: Path) -> None:
+        """Delete a recording whose run was made anew and is recorded at ``path``."""
+        why = ", since it has labels or a note, or is not listed"
+        try:
+            if before is None or self._store.delete(before):
+                return
+        except RecordingError as error:
+            why = f": {error}"
+        self._on_notice(f"{before.name} stays{why}; {path.name} is of the same query, which was tried anew.")
 
     def _lose(self, error: RecordingError, ended: Ended) -> None:
         self._lost += 1
