@@ -2,15 +2,11 @@
 
 import base64
 import html
-import io
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from spherloc.cameras.base import Camera
 from spherloc.errors import InputError
 from spherloc.frontend import trained
 from spherloc.frontend.view import View
@@ -22,6 +18,7 @@ from spherloc.mapping.pairs import MIN_MATCHES
 from spherloc.mapping.photographs import Photographs, cameras_of
 from spherloc.mapping.rig import shots_of, words
 from spherloc.types import FloatArray
+from spherloc_viz.plots.map_above import map_above
 
 MAP_FEATURES = {
     "sift": "SIFT",
@@ -151,16 +148,6 @@ def _far_words(far: Mapping[str, float]) -> str:
 
 THUMBNAIL_PX = 240
 MAX_THUMBNAILS = 40
-MAX_NAMED = 30
-"""Largest number of images whose names stand in the picture from above."""
-TOGETHER, MAX_LINES = 0.02, 4
-"""Images that are closer than this share of the extent of all have their names under each other, at most so many."""
-MAX_POINTS = 20_000
-CLOSE = 0.15
-"""If the images lie within this share of the picture, a second one shows them alone."""
-WITHIN = 0.98
-"""Share of the points that the picture shows: a few far points would make the others too small."""
-
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #1b1f24; }
 table { border-collapse: collapse; } td, th { padding: .2rem .8rem .2rem 0; text-align: left; vertical-align: top; }
@@ -187,7 +174,9 @@ def map_report(made: Map, found: Photographs) -> str:
     }
     rows = [_row(made, names, index) for index in range(len(views))]
     left = [view for view in views if view.name not in written.poses]
-    above = _from_above(made, cameras_of(views).values(), "metres" if made.scale.source else "units")
+    unit, centres = "metres" if made.scale.source else "units", _centres(made)
+    joined = len(cameras_of(views)) == 1  # those of several do not follow each other by their names
+    above, without_name = map_above(written.points, centres, joined, unit)
     return "\n".join(
         [
             '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Map</title>',
@@ -198,11 +187,15 @@ def map_report(made: Map, found: Photographs) -> str:
             *(f"<p>{html.escape(remark)}</p>" for remark in found.remarks),
             *_doubts(made),
             "<h2>From above</h2>",
-            f'<img alt="Points and cameras of the map from above" src="{above}">',
+            f'<img alt="Points and cameras of the map from above" src="{_data("png", above)}">',
+            f"<p>Without a name for lack of room: {without_name} of {len(centres)} images. The table says where each "
+            "image is.</p>"
+            if without_name
+            else "",
             "<h2>Not in the map</h2>" if left else "",
             *(_thumbnail(view, made, names) for view in left[:MAX_THUMBNAILS]),
             "<h2>Images</h2><table><tr><th>image</th><th>in the map</th><th>best partner</th><th>matches</th>"
-            "<th>gravity</th>"
+            f"<th>gravity</th><th>x, y, z in {unit}</th>"
             f"{'<th>off its position</th>' if made.scale.off_m else ''}</tr>",
             *rows,
             "</table></body></html>",
@@ -236,9 +229,21 @@ def _row(made: Map, names: list[str], index: int) -> str:
         f"<td>{html.escape(names[best] if counts[best] else 'none')}</td>",
         f'<td class="number">{counts[best]:,}</td>',
         f"<td>{html.escape(_gravity_of(made, name))}</td>",
+        f"<td>{_place(made, name)}</td>",
         _off(made, name),
     ]
     return f"<tr>{''.join(cells)}</tr>"
+
+
+def _centres(made: Map) -> dict[str, FloatArray]:
+    """Centres (3,) of the images by name."""
+    return {name: camera_centre(pose) for name, pose in made.written.poses.items()}
+
+
+def _place(made: Map, name: str) -> str:
+    """Where an image is in the map; empty if it is not in it."""
+    pose = made.written.poses.get(name)
+    return "" if pose is None else ", ".join(f"{value:.2f}" for value in camera_centre(pose))
 
 
 def _gravity_of(made: Map, name: str) -> str:
@@ -296,55 +301,6 @@ def _thumbnail(view: View, made: Map, names: list[str]) -> str:
     scale = THUMBNAIL_PX / pixels.shape[1]
     _, content = cv2.imencode(".jpg", cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
     return f'<p><img alt="" src="{_data("jpeg", content.tobytes())}"><br>{reason}</p>'
-
-
-def _from_above(made: Map, cameras: Collection[Camera], unit: str) -> str:
-    """Address of a PNG."""
-    points = made.written.points
-    centres = np.stack([camera_centre(pose) for pose in made.written.poses.values()])
-    shown = points[_near(points, centres)]
-    shown = shown[:: max(1, len(shown) // MAX_POINTS)]
-    extent = float(np.ptp(centres[:, :2], axis=0).max())
-    close = 0.0 < extent < CLOSE * float(np.ptp(shown[:, :2], axis=0).max(initial=0.0))
-    figure = Figure(figsize=(14 if close else 9, 6.5), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot(1, 2 if close else 1, 1, aspect="equal", adjustable="datalim")
-    axes.scatter(shown[:, 0], shown[:, 1], s=1.5, c="#8fa3b8", linewidths=0)
-    if close:
-        axes.scatter(centres[:, 0], centres[:, 1], s=28, c="#c0392b", zorder=3)
-        axes.set(xlabel=unit, ylabel=unit)
-        axes = figure.add_subplot(1, 2, 2, aspect="equal", adjustable="datalim", title="the cameras alone")
-    if len(cameras) == 1:  # those of several do not follow each other by their names
-        walk = np.stack([camera_centre(made.written.poses[name]) for name in sorted(made.written.poses)])
-        axes.plot(walk[:, 0], walk[:, 1], color="#d08a1c", linewidth=0.8)
-    axes.scatter(centres[:, 0], centres[:, 1], s=28, c="#c0392b", zorder=3)
-    if len(centres) <= MAX_NAMED:
-        for (x, y), words in words_at(centres[:, :2], list(made.written.poses)):
-            axes.text(x, y, words, fontsize=8, va="center", parse_math=False, clip_on=True)
-    axes.set(xlabel=unit, ylabel=unit)
-    axes.margins(0.2)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", metadata={"Software": None})
-    return _data("png", file.getvalue())
-
-
-def words_at(places: FloatArray, names: list[str]) -> list[tuple[tuple[float, float], str]]:
-    """Where (x, y) which words stand for images at places (N, 2): the names of those at one place under each other."""
-    apart, free = TOGETHER * float(np.ptp(places, axis=0).max()), np.ones(len(names), bool)
-    words = []
-    for k in range(len(names)):
-        there = np.flatnonzero(free & (np.abs(places - places[k]).max(axis=1) <= apart)) if free[k] else []
-        if len(there):
-            free[there] = False
-            lines = [f"  {names[other]}" for other in there[:MAX_LINES]]
-            lines += [f"  and {len(there) - MAX_LINES} more"] * (len(there) > MAX_LINES)
-            words.append(((float(places[k, 0]), float(places[k, 1])), "\n".join(lines)))
-    return words
-
-
-def _near(points: FloatArray, centres: FloatArray) -> np.ndarray:
-    away = np.linalg.norm(points - np.median(centres, axis=0), axis=1)
-    return away <= np.quantile(away, WITHIN) if len(points) else np.zeros(0, bool)
 
 
 def _data(kind: str, content: bytes) -> str:

@@ -1,4 +1,4 @@
-"""Names beside places of a picture, none over another or over the edge while there is room."""
+"""Names beside places of a picture, none over another or over the edge."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,40 +22,53 @@ _SPOTS = (
     (NEAR, FAR), (NEAR, -FAR), (-NEAR, FAR), (-NEAR, -FAR), (NEAR, 1.6 * FAR), (NEAR, -1.6 * FAR),
 )  # fmt: skip
 """Where a name is tried, right and up of its place, points."""
+_TOUCHING_PX2 = 1.0
+"""Area that a name may have in common with another one, or beyond the edge."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlaceName:
     """A name to be written beside a place."""
 
-    name: str
+    lines: tuple[str, ...]
+    """The name, or those of several things at one place, which are written under each other."""
     place: FloatArray
     """(2,) in the coordinates of the axes."""
     color: str
 
 
-def write_labels(axes: Axes, labels: Sequence[PlaceName], dots: FloatArray) -> None:
-    """Write the labels after all else is drawn; ``dots`` (N, 2) are places that no name should cover."""
+def write_labels(axes: Axes, labels: Sequence[PlaceName], dots: FloatArray) -> tuple[PlaceName, ...]:
+    """Write the labels after all else is drawn; ``dots`` (N, 2) are places that no name should cover.
+
+    Returns those that are not written, since they would lie over others or over the edge; earlier ones come first.
+    """
     figure = axes.figure
     assert isinstance(figure, Figure) and isinstance(figure.canvas, FigureCanvasAgg)
     figure.draw_without_rendering()  # fixes where the axes are
     renderer, edge = figure.canvas.get_renderer(), np.asarray(axes.get_window_extent().extents)
     centres = axes.transData.transform(np.reshape(dots, (-1, 2)))
-    taken = [np.concatenate([centre - DOT_PX, centre + DOT_PX]) for centre in centres]
+    covered = np.concatenate([centres - DOT_PX, centres + DOT_PX], axis=1)
+    taken, left_out = np.zeros((0, 4)), list[PlaceName]()
     for label in labels:
+        words = "\n".join(shorten(line, MAX_LETTERS) for line in label.lines)
         text = axes.annotate(
-            shorten(label.name, MAX_LETTERS), tuple(label.place.tolist()), xytext=_SPOTS[0], textcoords="offset points",
-            fontsize=FONT_SIZE, color=label.color, parse_math=False, annotation_clip=False,
+            words, tuple(label.place.tolist()), xytext=_SPOTS[0], textcoords="offset points", fontsize=FONT_SIZE,
+            color=label.color, parse_math=False, annotation_clip=False,
         )  # fmt: skip
         text.set_in_layout(False)
         tried = []
         for spot in _SPOTS:
             _move(text, spot)
             box = np.asarray(text.get_window_extent(renderer).extents)
-            tried.append((_outside(box, edge) + sum(_common(box, other) for other in taken), spot, box))
-        _, spot, box = min(tried, key=lambda one: one[0])
-        _move(text, spot)
-        taken.append(box)
+            tried.append((_outside(box, edge) + _common(box, taken), _common(box, covered), spot, box))
+        bad, _, spot, box = min(tried, key=lambda one: one[:2])
+        if bad > _TOUCHING_PX2:
+            text.remove()
+            left_out.append(label)
+        else:
+            _move(text, spot)
+            taken = np.concatenate([taken, box[None]])
+    return tuple(left_out)
 
 
 def _move(text, spot: tuple[float, float]) -> None:
@@ -65,12 +78,12 @@ def _move(text, spot: tuple[float, float]) -> None:
     text.set_verticalalignment("center" if up == 0.0 else "bottom" if up > 0.0 else "top")
 
 
-def _common(one: FloatArray, other: FloatArray) -> float:
-    """Area that two boxes (left, bottom, right, top) have in common, px^2."""
-    size = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
-    return float(np.prod(np.maximum(size, 0.0)))
+def _common(box: FloatArray, others: FloatArray) -> float:
+    """Area that a box (left, bottom, right, top) has in common with others (N, 4), px^2."""
+    size = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
+    return float(np.prod(np.maximum(size, 0.0), axis=1).sum())
 
 
 def _outside(box: FloatArray, edge: FloatArray) -> float:
     """Area of a box beyond the edge, px^2."""
-    return float(np.prod(box[2:] - box[:2])) - _common(box, edge)
+    return float(np.prod(box[2:] - box[:2])) - _common(box, edge[None])

@@ -21,6 +21,7 @@ from spherloc.experiments.results import DOUBTFUL, FAILED, POSED, SequenceResult
 from spherloc.experiments.summary import timed
 from spherloc.geometry import align_to_down, camera_centre
 from spherloc.types import BoolArray, FloatArray
+from spherloc_viz.plots.frames import Frame, around, corners, frames_of, with_room
 from spherloc_viz.plots.labels import MAX_LETTERS, PlaceName, write_labels
 from spherloc_viz.plots.sweeps import CURVE_MARKERS
 from spherloc_viz.style import ERROR_RAMP, ESTIMATE, OUTLIER, REFERENCE, TRUTH, css, error_scale
@@ -29,11 +30,6 @@ WIDTH_INCHES, WIDE_INCHES = 9.0, 14.0
 """Width of a picture with one panel and with two."""
 HEIGHT_INCHES = (4.0, 9.0)
 DPI = 150
-MARGIN = 0.08
-MIN_EXTENT_M = 0.4
-"""Least extent of the picture, so that a camera that stands still is not magnified to its noise."""
-CLOSE = 0.15
-"""If the queries lie within this share of the picture, a second one shows them alone."""
 MAX_POINTS = 20_000
 """Largest number of points of the map that are drawn."""
 WITHIN = 0.9
@@ -53,9 +49,6 @@ BESIDE = 2.0
 """Images of the map this near to the middle of the queries, in halves of their extent, are framed with them."""
 FEWEST_FRAMED = 3
 """Number of believed poses from which on the picture is framed by them, and not by doubtful ones too."""
-
-Frame = tuple[FloatArray, FloatArray]
-"""Middle (2,) and half the extent (2,) of a picture, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,28 +116,29 @@ def trajectory_png(results: SequenceResults, backdrop: Backdrop) -> bytes:
 
 def _with_near(places: FloatArray, images: FloatArray) -> Frame:
     """The frame of the queries' places (N, 2), with those of the map's images (R, 2) that are beside it."""
-    middle, half = _frame(places)
+    middle, half = around(places)
     near = (np.abs(images - middle) <= BESIDE * half.max()).all(axis=1)
-    return _frame(np.concatenate([places, images[near]]))
+    return around(np.concatenate([places, images[near]]))
 
 
 def _named_images(axes: Axes, names: Sequence[str], images: FloatArray) -> list[PlaceName]:
     """The names of the map's images in the picture, if they are few."""
     drawn = np.flatnonzero(_inside(axes, images)).tolist() if names else []
     few = drawn if len(drawn) <= MAX_NAMED else []
-    return [PlaceName(names[k], images[k], css(REFERENCE)) for k in few]
+    return [PlaceName((names[k],), images[k], css(REFERENCE)) for k in few]
 
 
 def _frames(results: SequenceResults, own: Frame, backdrop: Backdrop) -> list[Frame]:
-    """The frame that holds the map and the queries, whose frame is ``own``, and ``own`` too if it is far smaller."""
-    of_map = _from_above(results, np.concatenate([backdrop.points, backdrop.images]))
-    if not len(of_map):
+    """The frame that holds the map and the queries, whose frame is ``own``, and ``own`` too if it is far smaller.
+
+    Of a map of images they are framed, and points far from them are cut.
+    """
+    points, images = _from_above(results, backdrop.points), _from_above(results, backdrop.images)
+    if not len(points) and not len(images):
         return [own]
-    middle, half = own
-    low = np.minimum(of_map.min(axis=0), middle - half)
-    high = np.maximum(of_map.max(axis=0), middle + half)
-    whole = 0.5 * (low + high), _not_narrow(0.5 * (high - low)) * (1.0 + 0.5 * MARGIN)
-    return [whole, own] if half.max() < CLOSE * whole[1].max() else [whole]
+    if not len(images):
+        return frames_of(around(np.concatenate([points, corners(own)])), own)
+    return frames_of(with_room(np.concatenate([images, corners(own)]), points), own)
 
 
 def _panels(results: SequenceResults, frames: Sequence[Frame], more_inches: float) -> tuple[Figure, list[Axes]]:
@@ -247,7 +241,7 @@ def _named(axes: Axes, results: SequenceResults, places: FloatArray, true_places
     if np.count_nonzero(drawn) <= MAX_NAMED:
         chosen += list(np.flatnonzero(drawn & ~wrong))
     colors = {True: css(OUTLIER), False: "black"}
-    return [PlaceName(results.rows[k].query, at[k], colors[bool(wrong[k])]) for k in chosen[:MAX_NAMED]]
+    return [PlaceName((results.rows[k].query,), at[k], colors[bool(wrong[k])]) for k in chosen[:MAX_NAMED]]
 
 
 SEVERAL_COLORS = ("#1b6ca8", "#c77d0a", "#7b2d8b", "#3a8a3a", "#b02a30", "#5fb3e6", "#8c6d31", "#555555")
@@ -270,7 +264,7 @@ def trajectories_png(several: Sequence[tuple[str, SequenceResults]], backdrop: B
     everywhere = np.concatenate(places)
     below = 0.25 * ((len(several) + 4) // 2)
     framed = np.concatenate([_true_if_known(seen, true_places) for seen in places])
-    figure, panels = _panels(first, _frames(first, _frame(framed), backdrop), 1.3 + below)
+    figure, panels = _panels(first, _frames(first, around(framed), backdrop), 1.3 + below)
     for axes in panels:
         _map(axes, first, backdrop)
     if len(panels) > 1:
@@ -336,7 +330,7 @@ def _one_of_several(
         axes.plot(*true_places[lost].T, "x", color=color, markersize=8.0, markeredgewidth=1.4)
     if np.count_nonzero(lost) > MAX_LOST_NAMED:
         return []
-    return [PlaceName(results.rows[place].query, true_places[place], color) for place in np.flatnonzero(lost)]
+    return [PlaceName((results.rows[place].query,), true_places[place], color) for place in np.flatnonzero(lost)]
 
 
 def _headings(results: SequenceResults) -> FloatArray:
@@ -357,20 +351,6 @@ def _from_above(results: SequenceResults, positions_m: FloatArray) -> FloatArray
 def _true_if_known(places: FloatArray, true_places: FloatArray) -> FloatArray:
     """Where queries (Q, 2) are expected in the picture: one wrong pose far away must not shrink all others to a dot."""
     return np.where(np.isfinite(true_places), true_places, places)
-
-
-def _frame(places: FloatArray) -> Frame:
-    shown = places[np.isfinite(places).all(axis=1)]
-    if not len(shown):
-        return np.zeros(2), np.full(2, 0.5 * MIN_EXTENT_M)
-    low, high = shown.min(axis=0), shown.max(axis=0)
-    half = 0.5 * np.maximum(high - low, MIN_EXTENT_M)
-    return 0.5 * (low + high), _not_narrow(half) + 2.0 * MARGIN * half.max()
-
-
-def _not_narrow(half: FloatArray) -> FloatArray:
-    """Half an extent (2,) that is enlarged where a picture would be very flat, or narrow on a wide page."""
-    return np.maximum(half, [0.75 * half[1], 0.3 * half[0]])
 
 
 def _truth(axes: Axes, true_places: FloatArray, ordered: bool) -> None:

@@ -67,7 +67,7 @@ from spherloc_viz.commands.map import (
     main,
     scale_of_words,
 )
-from spherloc_viz.commands.map_report import map_report, summary, words_at
+from spherloc_viz.commands.map_report import map_report, summary
 from tests.waiting import LIMIT_S
 
 IMAGES = ("reference_002", "reference_003", "reference_004", "reference_005", "reference_006")
@@ -1074,10 +1074,3 @@ def test_new_images_with_a_calibration_tell_nothing_of_the_lens_of_the_map(tmp_p
     assert not _calibrated(tmp_path, (400, 300))
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 400 300 350 350 200 150\n")
     assert _calibrated(tmp_path, (400, 300)) and not _calibrated(tmp_path, (300, 400))
-
-
-def test_names_of_images_at_one_place_stand_under_each_other() -> None:
-    places = np.array([[0.0, 0.0], [10.0, 5.0], [0.1, -0.1], [10.0, 5.3]])
-    assert words_at(places, list("abcd")) == [((0.0, 0.0), "  a\n  c"), ((10.0, 5.0), "  b"), ((10.0, 5.3), "  d")]
-    ((_, words),) = words_at(np.zeros((6, 2)), list("abcdef"))
-    assert words.splitlines() == ["  a", "  b", "  c", "  d", "  and 2 more"]
