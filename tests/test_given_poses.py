@@ -1,6 +1,7 @@
 """Poses that another program found: read from its files, recorded, diagnosed, and solved again."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -168,6 +169,21 @@ def test_poses_with_a_table_of_matches_are_diagnosed(tmp_path: Path) -> None:
     assert "a.jpg: " in done.stdout and "b.jpg: " in done.stdout and "search missed the best pose" in done.stdout
     recorded = [path for path in (tmp_path / "runs").glob("*.rrd") if ".review." not in path.name]
     assert len(recorded) == 2 and all(repeat(path).same for path in recorded)
+
+
+def test_a_principal_point_that_seems_to_be_wrong_is_told_of_a_table(tmp_path: Path, capsys) -> None:
+    matches, camera, gravity = table_files(tmp_path, *matches_of("a.jpg"), *matches_of("b.jpg"))
+    poses, down = tmp_path / "poses.txt", tuple(map(float, scene_problem(NAME).gravity_map))
+    poses.write_text(words("a.jpg", true_pose()))
+    right = camera.read_text()
+    for changed, said in ((right, ""), (re.sub(r"(?m)^cx = .*", "cx = 1500.0", right), "is at 1500, ")):
+        camera.write_text(changed)
+        table = read_match_table(matches, camera, gravity, down)
+        diagnose_poses(poses, [table], None, None, False, None)
+        told = [line for line in capsys.readouterr().err.splitlines() if "The principal point of" in line]
+        assert len(told) == bool(said) and all(f"of the camera of a.jpg {said}" in line for line in told)
+        problem = table.problem("a.jpg", None)
+        assert isinstance(problem, Problem) and len(problem.remarks) == bool(said)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Doubts a calibration by where its principal point is."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from spherloc.cameras.base import Camera
@@ -31,3 +33,16 @@ def about_principal_point(name: str, camera: Camera) -> str:
             "pixels of images of this size."
         )
     return ""
+
+
+def about_principal_points(images: Iterable[tuple[str, Camera]]) -> list[str]:
+    """A sentence on the first camera whose principal point seems to be wrong, and one on how many others are like it.
+
+    ``images`` are their names and cameras.
+    """
+    named = {camera: name for name, camera in reversed(tuple(images))}
+    found = [
+        about for camera, name in named.items() if (about := about_principal_point(f"the camera of {name}", camera))
+    ]
+    more = [f"So it seems to be in {len(found) - 1} more of the {len(named)} cameras."] if len(found) > 1 else []
+    return found[-1:] + more

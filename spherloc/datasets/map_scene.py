@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from spherloc.cameras.principal_point import about_principal_point
+from spherloc.cameras.principal_point import about_principal_points
 from spherloc.datasets import scene_file
 from spherloc.datasets.query_gravity import BOUND_SD, GravitySettings, MeasuredGravity, read_gravity
 from spherloc.datasets.registration import Registration
@@ -230,16 +230,6 @@ def _contradiction(stated: Gravity, nearby: Gravity | None) -> tuple[str, ...]:
     )
 
 
-def _about_cameras(views: Iterable[View]) -> list[str]:
-    """A remark on the first camera whose principal point seems to be wrong, and on how many others are like it."""
-    cameras = {view.camera: view.name for view in reversed(tuple(views))}
-    found = [
-        about for camera, name in cameras.items() if (about := about_principal_point(f"the camera of {name}", camera))
-    ]
-    more = [f"So it seems to be in {len(found) - 1} more of the {len(cameras)} cameras."] if len(found) > 1 else []
-    return found[-1:] + more
-
-
 REQUIRED = {"kind", "name"}
 OPTIONAL = {"about", "frontend", "gravity", "masks", "options", "thresholds", "units"}
 OPTIONAL_EXAMPLE = """\
@@ -293,7 +283,7 @@ class MapSettings:
         wrong [frontend] and if there is no query or no reference.
         """
         given, asked = tuple(references), tuple(queries)
-        remarks = [*remarks, *_about_cameras((*asked, *given))]
+        remarks = [*remarks, *about_principal_points((view.name, view.camera) for view in (*asked, *given))]
         if self.masks is not None:
             given, asked = self._masked(path, given, asked, remarks)
         gravity = self.gravity

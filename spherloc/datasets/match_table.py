@@ -8,6 +8,7 @@ import numpy as np
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import load_camera
+from spherloc.cameras.principal_point import about_principal_point, about_principal_points
 from spherloc.datasets.correspondences import read_csv_of_queries
 from spherloc.datasets.query_gravity import read_gravity_file
 from spherloc.errors import InputError, ProblemError
@@ -40,6 +41,11 @@ class MatchTable:
     gravity_map: FloatArray
     """Unit vector (3,) pointing down in the map."""
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences on what seems to be wrong with the cameras."""
+        return tuple(about_principal_points(self.cameras.items()))
+
     def problem(self, name: str, pose: FloatArray | None) -> Problem | InputError:
         """The problem of a query, or what is wrong with it; ``pose`` is its ``cam_from_map`` (3, 4), if it has one."""
         try:
@@ -57,6 +63,7 @@ class MatchTable:
             gravity = self.gravity[name]
         else:
             raise InputError(f"{name}: has no row in the gravity file; add one.")
+        doubt = about_principal_point("the camera", self.cameras[name])
         return Problem(
             name=name,
             camera=self.cameras[name],
@@ -69,6 +76,7 @@ class MatchTable:
             gravity_source=gravity.source,
             truth_inliers=inliers,
             scene=str(self.path),
+            remarks=(doubt,) if doubt else (),
         )
 
 

@@ -78,8 +78,12 @@ def diagnose_poses(
 def _problems(
     path: Path | MatchTable, given: Mapping[str, FloatArray]
 ) -> Iterator[tuple[str, Problem | SpherlocError, Origin]]:
-    """For each query that has a pose: the name of the pose, the problem, and its origin."""
+    """For each query that has a pose: the name of the pose, the problem, and its origin.
+
+    What is remarkable about the scene or its cameras is printed first.
+    """
     if isinstance(path, MatchTable):
+        _say_all(path.remarks)
         for name in path.matches:
             if name in given or path.gravity is not None:
                 yield name, path.problem(name, given.get(name)), Origin("command")
@@ -93,6 +97,7 @@ def _problems(
     origin = Origin("command", str(path.resolve()), used_seed(scene, None))
     if not isinstance(scene, MapScene):
         problem = scene.problem(None)
+        _say_all(problem.remarks)
         image = None if problem.image is None else problem.image.name
         name = next((name for name in (problem.name, image, path.stem) if name in given), None)
         if name is not None:
@@ -100,6 +105,7 @@ def _problems(
         return
     views = [view for view in scene.queries if view.name in given]
     if views:
+        _say_all(scene.remarks)
         prepare(scene)
     with progress(len(views), "queries") as advance:
         for view in views:
@@ -109,6 +115,11 @@ def _problems(
                 problem = error
             yield view.name, problem, replace(origin, query=view.name)
             advance("")
+
+
+def _say_all(remarks: Sequence[str]) -> None:
+    for remark in remarks:
+        say(remark)
 
 
 def _run(problem: Problem, cam_from_map: FloatArray, bound_px: float | None) -> Trace:
