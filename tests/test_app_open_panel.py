@@ -195,8 +195,11 @@ def test_a_sequence_is_offered_as_one_map_unless_a_link_leads_out(visitor: Visit
         assert "metres are from its ground truth" in visitor.panel._list.content
     visitor.touch("open-folder:0:0:")
     assert "a recorded sequence of cam0 and cam1" in visitor.panel._list.content
-    visitor.touch("open-folder:0:0:room/mav0/cam1")
-    assert "Make a map of this sequence of cam1, 3 images" in visitor.panel._list.content
+    for place in ("cam1", "cam1/data"):
+        visitor.touch(f"open-folder:0:0:room/mav0/{place}")
+        assert "Make a map of this sequence of cam1, 3 images" in visitor.panel._list.content
+        assert "For a map of all cameras of this sequence, cam0 and cam1, go up to mav0." in visitor.panel._list.content
+        assert f"map-folder:0:room/mav0/{place}" in visitor.rows
     outside = folder.parent / "elsewhere"
     (folder / "room" / "mav0" / "cam1" / "data").rename(outside)
     (folder / "room" / "mav0" / "cam1" / "data").symlink_to(outside)

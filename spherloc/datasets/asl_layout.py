@@ -60,6 +60,12 @@ def asl_sequence(path: Path) -> AslSequence | None:
     return AslSequence(own.parent, {own.name: images})
 
 
+def of_all_cameras(sequence: AslSequence) -> AslSequence:
+    """The sequence with all of its cameras, where ``sequence`` is that of one of them (``mav0/cam0``)."""
+    whole = asl_sequence(sequence.folder)
+    return whole if whole is not None and whole.cameras.keys() >= sequence.cameras.keys() else sequence
+
+
 def camera_of_folder(folder: PurePath) -> str:
     """The name of the camera whose images are in a folder: that of the folder, of ``cam0/data`` cam0."""
     return folder.parent.name if folder.name == DATA and _CAMERA.fullmatch(folder.parent.name) else folder.name

@@ -21,6 +21,7 @@ COMMAND = {
     "more images": "--frames says how many of each camera",
     "other positions": "--positions, --distance or --camera-height goes before it",
     "fewer images": "give fewer --frames",
+    "all cameras": "give {folder}",
 }
 PAGE = {
     "calibration": "put {files} beside them, into that folder, and make the map again",
@@ -39,6 +40,7 @@ PAGE = {
     "more images": "the command spherloc map takes more",
     "other positions": "a Scale that you give goes before it",
     "fewer images": "take fewer folders of cameras",
+    "all cameras": "open the folder {folder}",
 }
 _words: ContextVar[Mapping[str, str]] = ContextVar("advice", default=COMMAND)
 

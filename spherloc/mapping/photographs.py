@@ -12,7 +12,7 @@ from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.principal_point import about_principal_point
 from spherloc.datasets.asl import asl_cameras, image_times
-from spherloc.datasets.asl_layout import DATA, SENSOR, AslSequence, asl_sequence
+from spherloc.datasets.asl_layout import DATA, SENSOR, AslSequence, asl_sequence, of_all_cameras
 from spherloc.datasets.given_path import SCENE, images_below, images_in_folders, what_it_is
 from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_folder, is_image, names_in
@@ -75,6 +75,7 @@ def photographs(
     Raises ``InputError`` as that does, and if there are fewer than two images or too many, or if no image has a mask.
     """
     found = with_cameras(folder, cameras, panorama, find_lens, choice=choice)
+    found = replace(found, remarks=(*_about_other_cameras(folder), *found.remarks))
     views, remarks = found.views, found.remarks
     if len(views) < MIN_IMAGES:
         raise InputError(
@@ -183,6 +184,17 @@ def _of_sequence(
             calibrations[name] = FoundCalibrations({sequence.called(own.file): own.camera})
         remarks += times.remarks
     return places, calibrations, remarks
+
+
+def _about_other_cameras(folder: Path) -> list[str]:
+    """That a folder has the images of one camera of a sequence with several, and where all of them are."""
+    sequence = asl_sequence(folder)
+    if sequence is None or (whole := of_all_cameras(sequence)).cameras.keys() == sequence.cameras.keys():
+        return []
+    return [
+        f"These are the images of {_some(tuple(sequence.cameras))} of a recorded sequence; for a map of all of its "
+        f"cameras, {_some(tuple(whole.cameras))}, {advice('all cameras').format(folder=whole.folder)}."
+    ]
 
 
 def cameras_of(views: Sequence[View]) -> dict[str, Camera]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spherloc.datasets.asl_layout import AslSequence, asl_sequence
+from spherloc.datasets.asl_layout import AslSequence, asl_sequence, of_all_cameras
 from spherloc.datasets.map_scene import DEFAULT_THRESHOLDS
 from spherloc.errors import InputError
 from spherloc.frontend.view import View
@@ -58,7 +58,7 @@ def ground_truth(folder: Path, queries: Sequence[View], mapped: Sequence[View]) 
     found = asl_sequence(folder)
     if found is None:
         return None
-    sequence = asl_sequence(found.folder) or found  # all of its cameras
+    sequence = of_all_cameras(found)
     truths = list(readable_truths(sequence, []))
     if not truths:
         return None

@@ -44,7 +44,8 @@ def test_calibrations_gravity_and_positions_are_found(tmp_path, rng, write, key)
         found = photographs(folder, {})
         assert len(found.views) == cameras * len(tree.times) and found.views[0].name == f"{inside}{START}.png"
         assert [found.views[0].camera.fx, found.views[-1].camera.fx] == [20.0, 19.0 + cameras]
-        assert all("calibration found beside them" in remark for remark in found.remarks), found.remarks
+        about = found.remarks[2 - cameras :]  # the first one is on the other camera
+        assert about and all("calibration found beside them" in remark for remark in about), found.remarks
         data = sequence_data(folder, found.views)
         assert len(data.stated.found) == len(data.positions.by_name) == len(found.views)
         for view in found.views:
@@ -256,6 +257,12 @@ def test_folders_that_are_no_sequence(tmp_path, rng):
     tree = euroc(tmp_path / "room", rng, count=2)
     assert asl_sequence(tmp_path) is None and asl_sequence(tree.mav / "imu0") is None
     assert list(asl_sequence(tree.folder).cameras) == ["cam0", "cam1"]
+    one = photographs(tree.mav / "cam0" / "data", {})
+    assert len(one.views) == 2 and one.remarks[0] == (
+        "These are the images of cam0 of a recorded sequence; for a map of all of its cameras, cam0, cam1, give "
+        f"{tree.mav}."
+    )
+    assert "all of its cameras" not in "".join(photographs(tree.folder, {}).remarks)
     (tree.mav / "cam2").mkdir()
     assert "Without images in a folder data, and left out: cam2." in with_cameras(tree.folder, {}).remarks
     photos = tmp_path / "photos"

@@ -55,7 +55,7 @@ class Listing:
     """Number of image files in it."""
     in_folders: dict[str, int]
     """Number of image files in each of its sub-folders that has some, or of each camera of a sequence in the ASL
-    layout; empty if it has image files itself, or if a link in it leads out of the allowed folders."""
+    layout; empty if it has other image files itself, or if a link in it leads out of the allowed folders."""
     sequence: bool = False
     """Whether it is such a sequence."""
 
@@ -110,11 +110,13 @@ class Roots:
         rows = tuple(describe(path, own) for path, own in entries[PAGE * page : PAGE * (page + 1)])
         above = self.place(folder.parent)
         folders = [] if photographs or outside else [path.name for path, _ in entries if path.is_dir()]
-        sequence = None if photographs or outside else self._sequence(folder)
+        sequence = None if outside else self._sequence(folder)
         counts = images_in_folders(folder, folders, MAX_FOLDERS) if sequence is None else images_of_cameras(sequence)
         at, recorded = self.place(folder) or "", sequence is not None
-        if not recorded:
+        if sequence is None:
             rows = tuple(self._with_sequence(folder, row) for row in rows)
+        else:
+            remarks = (*remarks, *self._about_other_cameras(sequence))
         return Listing(folder, at, above, rows, page, pages, remarks, photographs, counts, recorded)
 
     def _with_sequence(self, folder: Path, row: Row) -> Row:
@@ -123,6 +125,13 @@ class Roots:
         if sequence is None:
             return row
         return replace(row, about=f"a recorded sequence of {and_words(sorted(sequence.cameras))}")
+
+    def _about_other_cameras(self, sequence: AslSequence) -> Iterator[str]:
+        """Where all cameras of a sequence are, if it is that of one of several."""
+        whole = self._sequence(sequence.folder)
+        if whole is not None and whole.cameras.keys() > sequence.cameras.keys():
+            cameras = and_words(sorted(whole.cameras))
+            yield f"For a map of all cameras of this sequence, {cameras}, go up to {whole.folder.name}."
 
     def _sequence(self, folder: Path) -> AslSequence | None:
         """The sequence in the ASL layout that a folder is, if all of its cameras are below the roots."""

@@ -104,7 +104,7 @@ def _folder_html(listing: Listing, in_map: str, made: bool) -> str:
 
 def _map_title(listing: Listing) -> str:
     """What map could be made here; empty for none."""
-    if listing.photographs >= MIN_IMAGES:
+    if listing.photographs >= MIN_IMAGES and not listing.sequence:
         return f"Make a map of these {listing.photographs:,} photographs"
     inside = sum(listing.in_folders.values())
     if inside < MIN_IMAGES:
