@@ -22,6 +22,7 @@ from spherloc_viz.app.review import notes as notes_module
 from spherloc_viz.app.review.export import Exporter
 from spherloc_viz.app.review.filters import KEPT
 from spherloc_viz.app.review.run_library import RunLibrary
+from spherloc_viz.app.status import TAIL, _line_html
 from spherloc_viz.gallery import gallery_cases
 from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.review_file import read_review
@@ -487,3 +488,13 @@ def test_a_query_that_is_tried_anew_keeps_one_recording(tmp_path: Path) -> None:
     for query, anew in asked:
         runs.record(trace, SceneRequest("tiny", 1, query), anew)
     assert told == [None, None, tmp_path / "1.rrd", None, tmp_path / "4.rrd", None]
+
+
+def test_a_long_name_of_a_recording_is_cut_in_its_middle() -> None:
+    """What is seen ends with what makes the name unique; the text is whole, so that it can be selected and copied."""
+    name = f"20261129T192212Z_{'long-' * 12}name_ransac-2p_0_4de9384d.rrd"
+    shown = _line_html(f"Recorded as {name}")
+    assert re.sub("<[^>]*>", "", shown) == f"Recorded as {name}" and f'title="Recorded as {name}"' in shown
+    *_, last = re.findall("<span>([^<]*)</span>", shown)
+    assert "_0_4de9384d.rrd" in last and len(last) == TAIL
+    assert "file-name" not in _line_html(f"{name}: not recorded.") + _line_html(f"No room for {name}", wrong=True)

@@ -8,8 +8,9 @@ import viser
 
 from spherloc.errors import SpherlocError
 from spherloc_viz.app.review.filters import keep_html
-from spherloc_viz.app.text import begun, status_html
+from spherloc_viz.app.text import DIM, begun, box, status_html
 from spherloc_viz.app.web.viser_internals import update_widget
+from spherloc_viz.given_files import RECORDING
 
 log = logging.getLogger(__name__)
 
@@ -72,13 +73,23 @@ class Status:
                 self._complaint = None
 
 
+TAIL = 20
+"""Letters of a recording's name that are shown at its end: estimator, seed, and what makes it unique."""
+
+
 def _line_html(sentence: str, wrong: bool = False, keep: str = "") -> str:
     """As high as two lines, so that widgets below do not move under the pointer. ``touch.css`` cuts a longer sentence,
-    which is whole under a resting pointer; what went wrong is shown whole."""
+    which is whole under a resting pointer, and the name of a recording at its end in the middle, so that both what it
+    begins with and what it ends with are seen; what went wrong is shown whole."""
     button = f'<div class="words" style="float:right;padding:.2em .8em 0 .4em">{keep_html(keep)}</div>' if keep else ""
     kind = "" if wrong else ' class="two-lines"'
     look = f'title="{escape(sentence)}" style="font-size:12px;min-height:3.4em"'
-    return f"<div{kind} {look}>{button}{status_html(sentence, wrong)}</div>"
+    before, _, name = sentence.rpartition(" ")
+    if wrong or not name.endswith(RECORDING):
+        return f"<div{kind} {look}>{button}{status_html(sentence, wrong)}</div>"
+    parts = "".join(f"<span>{escape(part)}</span>" for part in (name[:-TAIL], name[-TAIL:]))
+    words = f'{escape(before)} <span class="file-name">{parts}</span>'
+    return f"<div {look}>{button}{box(words, f'font-size:12px;display:flow-root;{DIM}')}</div>"
 
 
 SHOWN_S = 15.0
