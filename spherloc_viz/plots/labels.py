@@ -17,11 +17,15 @@ DOT_PX = 8.0
 """Half the width of the square around each place that names leave free."""
 NEAR, FAR = 7.0, 18.0
 """Distances of a name from its place, points."""
-_SPOTS = (
+BESIDE = (
     (NEAR, 0.0), (-NEAR, 0.0), (NEAR, NEAR), (NEAR, -NEAR), (-NEAR, NEAR), (-NEAR, -NEAR), (0.0, NEAR), (0.0, -NEAR),
-    (NEAR, FAR), (NEAR, -FAR), (-NEAR, FAR), (-NEAR, -FAR), (NEAR, 1.6 * FAR), (NEAR, -1.6 * FAR),
 )  # fmt: skip
-"""Where a name is tried, right and up of its place, points."""
+ANYWHERE = (
+    *BESIDE, (NEAR, FAR), (NEAR, -FAR), (-NEAR, FAR), (-NEAR, -FAR), (NEAR, 1.6 * FAR), (NEAR, -1.6 * FAR),
+)  # fmt: skip
+"""Where a name is tried, right and up of its place, points; ``BESIDE`` where it is clear which place it names."""
+COVERED = 0.1
+"""Share of a name beside its place that may lie over other places."""
 _TOUCHING_PX2 = 1.0
 """Area that a name may have in common with another one, or beyond the edge."""
 
@@ -37,10 +41,13 @@ class PlaceName:
     color: str
 
 
-def write_labels(axes: Axes, labels: Sequence[PlaceName], dots: FloatArray) -> tuple[PlaceName, ...]:
+def write_labels(
+    axes: Axes, labels: Sequence[PlaceName], dots: FloatArray, beside: bool = False
+) -> tuple[PlaceName, ...]:
     """Write the labels after all else is drawn; ``dots`` (N, 2) are places that no name should cover.
 
-    Returns those that are not written, since they would lie over others or over the edge; earlier ones come first.
+    Returns those that are not written, since they would lie over others or over the edge; earlier ones come first. With
+    ``beside`` nor are those that would be away from their places or over others.
     """
     figure = axes.figure
     assert isinstance(figure, Figure) and isinstance(figure.canvas, FigureCanvasAgg)
@@ -52,17 +59,17 @@ def write_labels(axes: Axes, labels: Sequence[PlaceName], dots: FloatArray) -> t
     for label in labels:
         words = "\n".join(shorten(line, MAX_LETTERS) for line in label.lines)
         text = axes.annotate(
-            words, tuple(label.place.tolist()), xytext=_SPOTS[0], textcoords="offset points", fontsize=FONT_SIZE,
+            words, tuple(label.place.tolist()), xytext=BESIDE[0], textcoords="offset points", fontsize=FONT_SIZE,
             color=label.color, parse_math=False, annotation_clip=False,
         )  # fmt: skip
         text.set_in_layout(False)
         tried = []
-        for spot in _SPOTS:
+        for spot in BESIDE if beside else ANYWHERE:
             _move(text, spot)
             box = np.asarray(text.get_window_extent(renderer).extents)
             tried.append((_outside(box, edge) + _common(box, taken), _common(box, covered), spot, box))
-        bad, _, spot, box = min(tried, key=lambda one: one[:2])
-        if bad > _TOUCHING_PX2:
+        bad, over, spot, box = min(tried, key=lambda one: one[:2])
+        if bad > _TOUCHING_PX2 or (beside and over > COVERED * np.prod(box[2:] - box[:2])):
             text.remove()
             left_out.append(label)
         else:

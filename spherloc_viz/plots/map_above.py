@@ -49,7 +49,7 @@ def map_above(points: FloatArray, centres: Mapping[str, FloatArray], joined: boo
         walk = np.stack([centres[name][:2] for name in sorted(centres)])
         panels[-1].plot(*walk.T, color="#d08a1c", linewidth=0.8)
     labels = names_at(places, list(centres))
-    without = set(write_labels(panels[-1], labels, places))
+    without = set(write_labels(panels[-1], labels, places, beside=True))
     named = sum(min(len(label.lines), MAX_LINES) for label in labels if label not in without)
     file = io.BytesIO()
     figure.savefig(file, format="png", metadata={"Software": None})
