@@ -13,6 +13,7 @@ from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.estimators import default_options, estimate
 from spherloc_viz.app.catalog import Run, RunRequest, SceneRequest
 from spherloc_viz.app.controls.controls import DisplayControls
+from spherloc_viz.app.matches.match_card import MARGIN_PX, WIDTH_PX, MatchCard
 from spherloc_viz.app.stage import canvas as stage
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.canvas import Canvas
@@ -160,3 +161,31 @@ def test_what_is_hidden_is_right_for_where_the_viewer_stands_at_last(
         page.handle.camera._state.position = inside.position
     waiting.join(LIMIT_S)
     assert "cameras/estimate" in shown._painter.hidden and "map/points" not in shown._painter.hidden
+
+
+def test_a_card_has_a_side_whatever_a_page_tells_of_its_viewer(
+    page: ConnectedPage, scene_of: Callable[..., SyntheticScene]
+) -> None:
+    """It may tell no place at all."""
+    problem = scene_of("panorama", correspondences=40, outlier_rate=0.3).problem()
+    trace = estimate(problem, "mc")
+    picture = paint(trace, len(steps(trace)) - 1)
+    shown = Canvas(
+        page.handle, DisplayControls(page.handle.gui, print), lambda *_: None, lambda _: None, lambda *_: None, 0
+    )
+    for position in ((1.0, 2.0), "here", None):
+        page.handle.camera._state.position = position  # type: ignore[assignment]
+        shown._painter.clicked_x = 0.2
+        assert shown.card_is_right(picture, 310.0, 290.0)
+        shown._painter.clicked_x = 0.8
+        assert not shown.card_is_right(picture, 310.0, 290.0)
+
+
+@pytest.mark.parametrize("window_px", [500, 1024, 1366, 1920, 2560, 3840])
+def test_a_card_is_not_over_the_panels_beside_the_canvas(page: ConnectedPage, window_px: int) -> None:
+    placed: list[float] = []
+    scale, between_px = stage.text_scale(window_px), stage.canvas_width_px(window_px)
+    card = MatchCard(page.handle.gui, True, scale, 0.0)
+    card._panel.float = lambda x, y, width: placed.append(width)  # type: ignore[method-assign]
+    card.fit(scale, between_px)
+    assert placed[-1] + 2 * MARGIN_PX <= between_px and placed[-1] >= 0.9 * WIDTH_PX * scale

@@ -24,7 +24,7 @@ from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.panels.export_panel import Shown
 from spherloc_viz.app.plots.graph_view import CLIQUE_STEP
 from spherloc_viz.app.said_together import SaidTogether
-from spherloc_viz.app.stage.canvas import Canvas, panel_widths_px, text_scale
+from spherloc_viz.app.stage.canvas import Canvas, canvas_width_px, panel_widths_px, text_scale
 from spherloc_viz.app.stage.subjects import walk_at_end
 from spherloc_viz.app.text import (
     ToldBeside,
@@ -114,6 +114,7 @@ class RunDisplay:
     ) -> None:
         """``widths_px`` are those of the panels left and right of the canvas."""
         self._client, self.controls = client, controls
+        window_px = client.camera.image_width
         select, movable = callbacks.select, callbacks.move is not None
         self.panels = LeftPanels(
             client.gui,
@@ -123,7 +124,7 @@ class RunDisplay:
             callbacks.scene_of,
             widths_px[0],
         )
-        self.card = MatchCard(client.gui, movable, text_scale(client.camera.image_width))
+        self.card = MatchCard(client.gui, movable, text_scale(window_px), canvas_width_px(window_px))
         moved = callbacks.move or (lambda place: None)
         self.canvas = Canvas(client, self.controls.display, select, moved, callbacks.photograph, sum(widths_px))
         self._widths_px = widths_px
@@ -171,11 +172,12 @@ class RunDisplay:
         """The window has another width, as after zooming or on another screen: fit the panels and the text to it."""
         window_px = pixels_of(touch)
         widths_px, scale = panel_widths_px(window_px), text_scale(window_px)
+        if window_px:
+            self.card.fit(scale, canvas_width_px(window_px))
         if window_px and widths_px != self._widths_px:
             self._widths_px = widths_px
             self.panels.fit(widths_px[0])
             self._client.gui.main_panel.set_width(widths_px[1])
-            self.card.fit(scale)
             self.canvas.fit_text(scale)
 
     def open_map(self, label: str, scene: MapScene, mesh: bytes | None) -> None:

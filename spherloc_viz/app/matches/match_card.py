@@ -1,5 +1,6 @@
 """The card about the selected matches: whether the run kept them and why, and how they can be changed."""
 
+import math
 from collections.abc import Callable
 from html import escape
 from pathlib import Path
@@ -66,8 +67,19 @@ def _crop_html(path: Path | None, pixel: FloatArray, name: str) -> str:
 
 
 WIDTH_PX, HEIGHT_PX = 310.0, 290.0
-"""Width of the card, and about its height while it is folded."""
+"""Width of the card, and about its height while it is folded, for text of the usual size."""
+LEAST_PX = 200.0
+"""Least width of the card, where the canvas is narrower."""
 MARGIN_PX = 8.0
+EDGES_PX = 8.0
+"""Of the panels beside the canvas, which are so much wider than they are told to be, both together."""
+
+
+def _size_px(text_scale: float, canvas_px: float) -> tuple[float, float]:
+    """Width and about the height of the card: not over the panels beside the canvas, where that is wide enough."""
+    full_px, room_px = WIDTH_PX * text_scale, canvas_px - EDGES_PX - 2.0 * MARGIN_PX
+    width_px = min(full_px, max(LEAST_PX * text_scale, room_px))
+    return width_px, HEIGHT_PX * text_scale * full_px / width_px
 
 
 class MatchCard:
@@ -76,9 +88,13 @@ class MatchCard:
     It lies over the canvas, so the longer parts are folded until the user opens them.
     """
 
-    def __init__(self, gui: viser.GuiApi, editable: bool = True, text_scale: float = 1.0) -> None:
-        """``editable`` says whether the page may change matches; ``text_scale`` is the factor of the text size."""
-        self._editable, self._width_px = editable, WIDTH_PX * text_scale
+    def __init__(
+        self, gui: viser.GuiApi, editable: bool = True, text_scale: float = 1.0, canvas_px: float = math.inf
+    ) -> None:
+        """``editable`` says whether the page may change matches; ``text_scale`` is the factor of the text size, and
+        ``canvas_px`` the width of the page between its panels."""
+        self._editable = editable
+        self._width_px, self._height_px = _size_px(text_scale, canvas_px)
         self._panel = gui.add_panel(visible=False)
         with self._panel.add_tab("Selection"):
             self._html = gui.add_html("")
@@ -89,10 +105,12 @@ class MatchCard:
         self._right = False
         self._place()
 
-    def fit(self, text_scale: float) -> None:
-        """Be as wide as text of another size needs it."""
-        self._width_px = WIDTH_PX * text_scale
-        self._place()
+    def fit(self, text_scale: float, canvas_px: float) -> None:
+        """Be as wide as text of another size needs it, if there is room for that between the panels."""
+        size_px = _size_px(text_scale, canvas_px)
+        if size_px != (self._width_px, self._height_px):
+            self._width_px, self._height_px = size_px
+            self._place()
 
     def _place(self) -> None:
         self._panel.float(x=-MARGIN_PX if self._right else MARGIN_PX, y=MARGIN_PX, width=self._width_px)
@@ -127,7 +145,7 @@ class MatchCard:
         )
         if not selected or (self._drawn is not None and self._drawn[0] is trace and self._drawn[1:] == drawn[1:]):
             return
-        belongs_right = right(self._width_px, HEIGHT_PX * self._width_px / WIDTH_PX)
+        belongs_right = right(self._width_px, self._height_px)
         if belongs_right != self._right:
             self._right = belongs_right
             self._place()

@@ -191,17 +191,20 @@ class Canvas:
     def _room(self) -> "_Room | None":
         """What a viewer where the page's viewer stands must not see; None if there is nothing to see, or if the page
         has told no position."""
-        picture = self._picture
-        try:
-            position = np.array(self._client.camera.position, dtype=np.float64).reshape(3)
-        except (TypeError, ValueError):  # viser does not check what a page sends about its camera
-            return None
-        if picture is None:
+        picture, position = self._picture, self._position()
+        if picture is None or position is None:
             return None
         hidden = views.before_the_eyes(picture, position) | self._cut(picture, position)
         if self._looked is None or self._looked[0] != SPHERE:
             hidden |= views.over_the_walk(picture, position)
         return _Room(hidden, (position, views.inside(picture, position)))
+
+    def _position(self) -> np.ndarray | None:
+        """Where the page's viewer stands (3,); None if the page has told no position."""
+        try:
+            return np.array(self._client.camera.position, dtype=np.float64).reshape(3)
+        except (TypeError, ValueError):  # viser does not check what a page sends about its camera
+            return None
 
     def _cut(self, picture: Picture, position: np.ndarray) -> frozenset[str]:
         """Names of the labels that the canvas' edge would cut for a viewer at that position (3,)."""
@@ -228,7 +231,8 @@ class Canvas:
     def card_is_right(self, picture: Picture, width_px: float, height_px: float) -> bool:
         """Whether a card of that size hides less of the selection and of the labels at the upper right of the canvas
         than at its upper left; where it is the same, whether the last click was in the left half."""
-        view = self._view_from(np.array(self._client.camera.position, dtype=np.float64))
+        position = self._position()
+        view = None if position is None else self._view_from(position)
         if view is None:
             return self._painter.clicked_x < 0.5
         aspect, half_px = self._aspect(), 0.5 * max(1, min(self._client.camera.image_height, MAX_PX))
@@ -354,6 +358,11 @@ class Canvas:
 def panel_widths_px(window_px: int) -> tuple[int, int]:
     """Widths of the panels left and right of the canvas."""
     return next(widths for least, widths, _ in WINDOWS_PX if window_px >= least)
+
+
+def canvas_width_px(window_px: int) -> int:
+    """Width of the canvas between the panels, or of the whole window where they are not beside it."""
+    return window_px - (sum(panel_widths_px(window_px)) if window_px >= NARROW_PX else 0)
 
 
 def text_scale(window_px: int) -> float:
