@@ -11,8 +11,9 @@ import pytest
 from sweep_deaths import DeadlyStore
 
 from spherloc.datasets.variation import Variation
-from spherloc.experiments.sweep import Entrant, Job, planned, run_sweep, solve
+from spherloc.experiments.sweep import Entrant, Job, planned, run_sweep
 from spherloc.experiments.sweep_rows import Point
+from spherloc.experiments.sweep_workers import solve
 from spherloc.trace import Trace
 from spherloc_viz.commands.run import Records
 from spherloc_viz.commands.sweep import SweepRecordings, sweep

@@ -21,10 +21,9 @@ from spherloc.datasets import load_scene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
-from spherloc.experiments import sweep
+from spherloc.experiments import sweep_cluster, sweep_workers
 from spherloc.experiments.sweep import (
     MAX_DEATHS,
-    NICENESS,
     TASK_S,
     Backlog,
     Entrant,
@@ -34,6 +33,7 @@ from spherloc.experiments.sweep import (
     planned,
     run_sweep,
 )
+from spherloc.experiments.sweep_workers import NICENESS
 from spherloc.metrics import evaluate
 from spherloc.warm_up import warm_up
 from tests.waiting import LIMIT_S, until
@@ -166,7 +166,7 @@ def test_a_machine_that_starts_no_workers_is_a_sentence(tmp_path: Path, monkeypa
     def read_only(*words: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system")
 
-    monkeypatch.setattr(sweep, "ProcessPoolExecutor", read_only)
+    monkeypatch.setattr(sweep_workers, "ProcessPoolExecutor", read_only)
     with pytest.raises(InputError, match=r"cannot be started \(Read-only file system\); see whether /dev/shm"):
         list(run_sweep(small_plan(tmp_path)))
 
@@ -177,7 +177,7 @@ def test_a_machine_that_starts_one_worker_and_no_more_is_a_sentence(
     """Further processes are started when there is work for them."""
 
     def submit(self: ProcessPoolExecutor, job: object, *words: object) -> Future:
-        if job is sweep.solve:
+        if job is sweep_workers.solve:
             raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
         return started(self, job, *words)  # type: ignore[arg-type]
 
@@ -191,7 +191,7 @@ def test_workers_that_do_not_come_are_a_sentence_and_are_ended(tmp_path: Path, m
     asleep = tmp_path / "python"
     asleep.write_text("#!/bin/sh\nexec sleep 600\n")
     asleep.chmod(0o755)
-    monkeypatch.setattr(sweep, "START_S", 0.5)
+    monkeypatch.setattr(sweep_workers, "START_S", 0.5)
     before = multiprocessing.spawn.get_executable()
     multiprocessing.set_executable(str(asleep))
     try:
@@ -299,7 +299,7 @@ def test_a_cluster_gives_the_same_rows_though_a_worker_is_killed(tmp_path: Path)
 
 def test_no_cluster_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = small_plan(tmp_path)
-    monkeypatch.setattr(sweep, "CONNECT_S", 0.5)
+    monkeypatch.setattr(sweep_cluster, "CONNECT_S", 0.5)
     for address, said in (("tcp://127.0.0.1:9", "no Dask scheduler answers at"), ("host", "missing port number")):
         with pytest.raises(InputError, match=said):
             next(run_sweep(plan, scheduler=address))
