@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera, model_name
 from spherloc.datasets import Scene, bundled_scenes, load_scene
-from spherloc.datasets.failures import StagedScene
 from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.staged import StagedScene
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.datasets.variation import Variation
 from spherloc.errors import InputError, show

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from spherloc.datasets import Scene, load_scene
-from spherloc.datasets.failures import StagedScene
 from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.staged import StagedScene
 from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, Diagnosis, diagnose
 from spherloc.estimators import estimate

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from spherloc.datasets import bundled_scenes, load_scene, scene_file
-from spherloc.datasets.failures import CUBE, Group, StagedScene
 from spherloc.datasets.scene_file import check_keys, integer, text
+from spherloc.datasets.staged import CUBE, Group, StagedScene
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.datasets.variation import EDITS, Variation, parse_variation
 from spherloc.diagnosis import Cause

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from spherloc.cameras.base import in_image
-from spherloc.datasets.failures import GROUP_KINDS, NEAR_M, PLACES, Group, StagedScene
+from spherloc.datasets.failures import PLACES
+from spherloc.datasets.staged import GROUP_KINDS, NEAR_M, Group, StagedScene
 from spherloc.errors import InputError
 from spherloc.geometry import DOWN, camera_centre, transform
 from spherloc.refine import residuals_px
