@@ -38,6 +38,7 @@ from spherloc_viz.app.services import Services
 from spherloc_viz.app.stage.canvas import panel_widths_px
 from spherloc_viz.app.status import Notices, Status
 from spherloc_viz.app.text import begun
+from spherloc_viz.app.waits import Waits
 from spherloc_viz.app.web.touch import READY, Touch, Touches
 from spherloc_viz.app.web.viser_internals import at_once, follow_changes, guard_callbacks, is_linked
 from spherloc_viz.app.workers import Job, LatestWorker
@@ -101,6 +102,8 @@ class Session:
             self.redraw, self.select, self._move_camera, self._press_photograph, self._catalog.map_scene
         )
         self._display = RunDisplay(client, self._touches, self._controls, callbacks, (left_px, right_px))
+        shown = self._status, self._controls, self._display
+        self._waits = Waits(self._catalog, services.compilation, shown, lambda: self._run, self._page.ask)
         self._listen()
         self._built = True
         # Only now may the page report presses: all handlers are registered.
@@ -216,16 +219,7 @@ class Session:
 
     def prepare_estimator(self, name: str, watch: Watch) -> None:
         """Return when an estimator is compiled; raises ``Cancelled`` if ``watch`` ends that."""
-        if self._services.compilation is not None:
-            self._services.compilation.wait_for(name, watch, self._say_wait)
-
-    def _say_wait(self, sentence: str) -> None:
-        """Say why an estimator is not ready; a page without a run shows that in its empty canvas."""
-        self._status.say(sentence)
-        if self._run is None:
-            panels = self._display.panels
-            panels.begin_opening(self._controls.scene.read().scene)
-            panels.tell_opening(sentence, None)
+        self._waits.for_estimator(name, watch)
 
     def _move_camera(self, true_camera: TrueCamera) -> None:
         self._controls.scene.true_camera = true_camera
@@ -383,41 +377,8 @@ class Session:
         return opened
 
     def _problem(self, request: SceneRequest) -> Problem:
-        """The problem that the page asks for; while images are matched, the page shows the progress.
-
-        Raises ``Cancelled`` if a person ends it while the map is described.
-        """
-        scene = self._catalog.map_scene(request.scene)
-        if scene is None:
-            return self._catalog.problem(request)
-        if scene.stored_problem(request.query) is not None:
-            return self._catalog.problem(request)
-        panels = self._display.panels
-        watch = self._controls.slow.begin(lasting=True)
-        try:
-            watch.begin("map", 1.0)
-            if self._run is None or request.scene != self._run.request.scene.scene:
-                panels.begin_opening(request.scene)
-                panels.tell_opening("Making the map …", 0.0)
-                self._display.open_map(request.scene, scene, self._catalog.mesh(request.scene))
-                self._page.ask()
-
-            def report(done: int, count: int) -> None:
-                words = f"Describing the map: {done} of {count} images …"
-                self._status.say(words)
-                panels.tell_opening(words, done / (count + 1))
-                watch.expect(count)
-                watch.reach(done)
-
-            scene.prepare(report)
-            self._status.say("Reading and matching images …")
-            panels.tell_opening("Reading and matching images …", 0.9)
-            watch.check()
-            problem = self._catalog.problem(request)
-            watch.check()
-            return problem
-        finally:
-            self._controls.slow.end()
+        """The problem that the page asks for; raises ``Cancelled`` if a person ends it while the map is described."""
+        return self._waits.for_problem(request)
 
     def _settle(self) -> float | None:
         """Record the page's run; returns the seconds to the next attempt, None if there is nothing more to do."""

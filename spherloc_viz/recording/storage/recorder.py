@@ -182,9 +182,11 @@ class Recorder:
 
     def _replace(self, before: Path | None, path: Path) -> None:
         """Delete a recording whose run was made anew and is recorded at ``path``."""
+        if before is None:
+            return
         why = ", since it has labels or a note, or is not listed"
         try:
-            if before is None or self._store.delete(before):
+            if self._store.delete(before):
                 return
         except RecordingError as error:
             why = f": {error}"
