@@ -14,7 +14,7 @@ joined by single pairs (see ``joining``).
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -85,7 +85,7 @@ def reconstruct(
     for _ in range(ROUNDS):
         cut = set[Names]()
         for keep in (0.0, STRONG):
-            models, apart = _models_of(pycolmap, left, left.counts(), keep, tell, evidence)
+            models, apart = _models_of(pycolmap, _UsedPairs(left, left.counts(), keep), tell, evidence)
             made.append(models)
             cut |= apart
         if not cut or evidence is None:
@@ -114,38 +114,44 @@ def _rigid(
     if not shots:
         return ()
     counts = matched.counts()
-    models, _ = _models_of(pycolmap, matched, counts * one_camera(matched.names, shots), 0.0, tell)
+    models, _ = _models_of(pycolmap, _UsedPairs(matched, counts * one_camera(matched.names, shots)), tell)
     return _joined(models, shots, gravity, counts, with_ties(counts + matched.same_place, matched.names, shots))
 
 
-def _models_of(
-    pycolmap: Any,
-    matched: Matched,
-    counts: NDArray[np.int64],
-    keep: float,
-    tell: Tell,
-    evidence: PairEvidence | None = None,
-) -> tuple[tuple[Reconstruction, ...], set[Names]]:
-    """Models, the largest first, of the pairs with at least the share ``keep`` of the matches of either image's best
-    pair, and the pairs that joined what contradictions showed to be apart.
+@dataclass(frozen=True, eq=False)
+class _UsedPairs:
+    """The pairs of images from which models are made."""
 
-    ``counts`` (V, V) are the numbers of matches of the pairs that may be used. With ``evidence``, models are cut, too,
-    where images stand elsewhere than their pair says.
-    """
-    ids = list(matched.ids.values())
-    with TemporaryDirectory() as folder:  # COLMAP uses all pairs of a database, and writes its models into a folder
-        database = Path(folder) / "matches.db"
-        shutil.copyfile(matched.database, database)
-        best = counts.max(axis=1)
-        pairs = combinations(range(len(ids)), 2)
-        weak = [pair for pair in pairs if not counts[pair] or counts[pair] < keep * best[list(pair)].max()]
+    matched: Matched
+    """All pairs that match."""
+    counts: NDArray[np.int64]
+    """(V, V) number of matches of each pair that may be used; 0 for others."""
+    keep: float = 0.0
+    """Least share of the matches of the best pair of either image."""
+
+    def write(self, pycolmap: Any, database: Path) -> None:
+        """Write a database of these pairs alone, since COLMAP uses all that a database has."""
+        shutil.copyfile(self.matched.database, database)
+        ids, counts, best = list(self.matched.ids.values()), self.counts, self.counts.max(axis=1)
         with pycolmap.Database.open(str(database)) as opened:
-            for pair in weak:
+            for pair in combinations(range(len(ids)), 2):
                 one, other = ids[pair[0]], ids[pair[1]]
-                if opened.exists_two_view_geometry(one, other):
+                used = counts[pair] and counts[pair] >= self.keep * best[list(pair)].max()
+                if not used and opened.exists_two_view_geometry(one, other):
                     opened.delete_two_view_geometry(one, other)
                     opened.delete_matches(one, other)
-        models = _models(pycolmap, database, Path(folder), len(ids), tell)
+
+
+def _models_of(
+    pycolmap: Any, used: _UsedPairs, tell: Tell, evidence: PairEvidence | None = None
+) -> tuple[tuple[Reconstruction, ...], set[Names]]:
+    """Models of the pairs that are used, the largest first, and the pairs that joined what contradictions showed to be
+    apart. With ``evidence``, models are cut, too, where images stand elsewhere than their pair says."""
+    matched, counts = used.matched, used.counts
+    with TemporaryDirectory() as folder:  # COLMAP writes its models into a folder
+        database = Path(folder) / "matches.db"
+        used.write(pycolmap, database)
+        models = _models(pycolmap, database, Path(folder), len(matched.ids), tell)
     rotations, agreeing = matched.rotations(matched.verified), matched.rotations(matched.agreed)
     found, cut = list[Reconstruction](), set[Names]()
     for model in models:
