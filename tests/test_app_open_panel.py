@@ -209,31 +209,33 @@ def test_a_sequence_is_offered_as_one_map_unless_a_link_leads_out(visitor: Visit
     assert "a recorded sequence" not in visitor.panel._list.content
 
 
+@pytest.mark.parametrize("place", ["walk", "walk/mav0/cam0/data"])
 def test_other_images_of_a_sequence_are_localized_in_its_own_map(
-    visitor: Visitor, folder: Path, rng: np.random.Generator
+    visitor: Visitor, folder: Path, rng: np.random.Generator, place: str
 ) -> None:
     """If most of its images are not in the map."""
     data = folder / "walk" / "mav0" / "cam0" / "data"
     data.mkdir(parents=True)
-    names = [f"mav0/cam0/data/{1_520_530_308_000_000_000 + 50_000_000 * k}.png" for k in range(120)]
+    inside = "" if place.endswith("data") else "mav0/cam0/data/"
+    names = [f"{inside}{1_520_530_308_000_000_000 + 50_000_000 * k}.png" for k in range(120)]
     for name in names:
-        cv2.imwrite(str(folder / "walk" / name), np.zeros((320, 640), np.uint8))
+        cv2.imwrite(str(folder / place / name), np.zeros((320, 640), np.uint8))
     model = sample_model(rng, models=(EQUIRECTANGULAR,))
     images = [(*one[:3], name, one[4]) for one, name in zip(model.images, names[::30], strict=True)]
     written = write(folder / "walk_map" / "model", binary_files(replace(model, images=images)))
-    head = MapHead("walk (units unknown)", "A map.", "../walk", UNITS_UNKNOWN, ("", "[gravity]", "map = [0, 0, -1]"))
+    head = MapHead("walk (units unknown)", "One.", f"../{place}", UNITS_UNKNOWN, ("", "[gravity]", "map = [0, 0, -1]"))
     (written.parent / "scene.toml").write_text(scene_text(head, names[::30]))
     visitor.touch("open-scene:0:walk_map/scene.toml")
-    visitor.touch("open-folder:0:0:walk")
+    visitor.touch(f"open-folder:0:0:{place}")
     assert "Localize other images of this sequence in its map" in visitor.panel._list.content
     visitor.touch("open-folder:0:0:")
     assert not [row for row in visitor.rows if row.startswith("localize-folder")], "the folder above"
-    visitor.touch("localize-folder:0:walk")
+    visitor.touch(f"localize-folder:0:{place}")
     queries = {view.name for view in visitor.opened[-1].scene.queries}
     assert len(queries) == 40 and not queries & set(names[::30])
     for name in names[7:]:
-        (folder / "walk" / name).unlink()
-    visitor.touch("open-folder:0:0:walk")
+        (folder / place / name).unlink()
+    visitor.touch(f"open-folder:0:0:{place}")
     assert "Localize other images" not in visitor.panel._list.content, "four of seven may be in the map"
 
 
