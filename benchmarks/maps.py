@@ -95,25 +95,30 @@ def errors_m(poses: dict[str, FloatArray], places: dict[str, FloatArray]) -> Flo
     return best
 
 
+def cells(folder: Path, places: dict[str, FloatArray], features: str) -> str:
+    """Some cells of a table: the maps of the images in a folder with known positions (3,), how many of these are right
+    and wrong in them, and their median error."""
+    views = photographs(folder, {}).views
+    try:
+        made = make_map(MapRequest(views, folder, how=how_of(features)), folder.with_name("map"))
+    except InputError as error:
+        return f"none: {error} | | | |"
+    maps = [one.written.poses for one in (made, *made.groups)]
+    off = [errors_m(poses, places) for poses in maps if len(poses) >= FEW]
+    pairs = sum(len(poses) < FEW for poses in maps)
+    joined = np.concatenate(off) if off else np.empty(0)
+    wrong, right = np.count_nonzero(joined > WRONG_M), joined[joined <= WRONG_M]
+    sizes = " + ".join(str(len(errors)) for errors in off) + (f" and {pairs} of two" if pairs else "")
+    median = f"{100 * np.median(right):.1f}" if len(right) else "-"
+    return f"{sizes} | {len(right)} | {wrong} | {median} |"
+
+
 def row(world: str, count: int, seed: int, change: bool, features: str) -> str:
     """One line of the table."""
     title = f"{world}, {count}" + (f", seed {seed}" if seed else "") + (", uneven" if change else "")
     with TemporaryDirectory() as place:
         folder = Path(place) / "panoramas"
-        places = photographed(world, count, seed, change, folder)
-        views = photographs(folder, {}).views
-        try:
-            made = make_map(MapRequest(views, folder, how=how_of(features)), Path(place) / "map")
-        except InputError as error:
-            return f"| {title} | none: {error} | | | |"
-        maps = [one.written.poses for one in (made, *made.groups)]
-        off = [errors_m(poses, places) for poses in maps if len(poses) >= FEW]
-        pairs = sum(len(poses) < FEW for poses in maps)
-    joined = np.concatenate(off) if off else np.empty(0)
-    wrong, right = np.count_nonzero(joined > WRONG_M), joined[joined <= WRONG_M]
-    sizes = " + ".join(str(len(errors)) for errors in off) + (f" and {pairs} of two" if pairs else "")
-    median = f"{100 * np.median(right):.1f}" if len(right) else "-"
-    return f"| {title} | {sizes} | {len(right)} | {wrong} | {median} |"
+        return f"| {title} | {cells(folder, photographed(world, count, seed, change, folder), features)}"
 
 
 def main() -> None:

@@ -21,15 +21,18 @@ from spherloc.mapping.later import with_images
 from spherloc.mapping.matched import Matched, Names
 from spherloc.mapping.model import Reconstruction, SeenPoints, contradictions, points_of
 from spherloc.mapping.pair_evidence import PairEvidence, VerifiedPair
+from spherloc.mapping.pairs import SURE
 from spherloc.mapping.parallel import Tell
 from spherloc.types import FloatArray
 
 MIN_FITTING, LEAST, MOST = 20, 0.3, 0.6
 """Two maps are joined if so many matches between them fit, and the second share of those of the pair that joins them.
 From the third share on it does not matter where in the view they lie."""
-MIN_RADIUS_DEG, MIN_RADIUS_ONE_THING_DEG = 65.0, 80.0
-"""Else they must not lie within a smaller part of it (``Between.radius_deg``), as those of one thing that stands at two
-places do; the second if the pair was taken for such a thing."""
+MIN_RADIUS_DEG, MIN_RADIUS_UNSURE_DEG = 65.0, 80.0
+"""Else those of panoramas must not lie within a smaller part of it (``Between.radius_deg``), as those of one thing that
+stands at two places do; the second if the pair is not sure."""
+SURE_ALONE = 2.0 * SURE
+"""Pairs of other images that are less sure join nothing."""
 MAX_WORK = 1000
 """Joins are tried until the maps that were made for that have so many images together."""
 
@@ -87,7 +90,8 @@ class _JoinSearch:
     ) -> None:
         self._evidence, self._tell, self._work = evidence, tell, 0
         self._models, self._alone = [self._judged(one) for one in models], frozenset(alone)
-        self._pairs = sorted(evidence.pairs, key=lambda pair: (-evidence.strength(pair), pair.names))
+        pairs = [pair for pair in evidence.pairs if evidence.panoramas or pair.sureness >= SURE_ALONE]
+        self._pairs = sorted(pairs, key=lambda pair: (-evidence.strength(pair), pair.names))
         self._known: dict[tuple[Names, frozenset[str], frozenset[str]], Reconstruction | None] = {}
 
     def run(self, left_out: frozenset[Names]) -> _Result:
@@ -173,8 +177,8 @@ class _JoinSearch:
         share = self._evidence.share(pair)
         if sum(between.counts.values()) < MIN_FITTING or share < LEAST:
             return False
-        radius_deg = MIN_RADIUS_ONE_THING_DEG if pair.one_thing else MIN_RADIUS_DEG
-        if share < MOST and between.radius_deg < radius_deg:
+        radius_deg = MIN_RADIUS_UNSURE_DEG if pair.sureness < SURE else MIN_RADIUS_DEG
+        if self._evidence.panoramas and share < MOST and between.radius_deg < radius_deg:
             return False
         counts = between.added_to(_counts(whole, other), whole.ids)
         points = {**points_of(whole.model), **moved.points}

@@ -26,7 +26,7 @@ from spherloc.frontend.features import VERSION, Features, extract
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
-from spherloc.mapping.pairs import MIN_MATCHES, ImagePairs, relative
+from spherloc.mapping.pairs import MIN_MATCHES, SURE, ImagePairs, relative
 from spherloc.mapping.parallel import Tell, as_completed
 from spherloc.mapping.rotations import agreeing
 from spherloc.mapping.triangles import Pair, open_triangles
@@ -67,10 +67,14 @@ class Matched:
     """``TwoViewGeometry`` of the pairs with a pose, by the numbers of their images."""
     agreed: dict[Pair, Any]
     """Those of them whose rotations agree with those of the others."""
-    one_thing: dict[Pair, Any]
-    """The same of pairs that may show one thing at two places, which are not in ``verified``."""
+    unsure: dict[Pair, Any]
+    """The same of pairs whose pose may be wrong, which are not in ``verified``."""
+    sureness: dict[Pair, float]
+    """``ImagePairs.sureness`` of pairs in both, but for those that were found through an image between."""
     same_place: NDArray[np.int64]
     """(V, V) number of matches of the pairs that were taken from one place."""
+    none_sure: bool = False
+    """Whether pairs are in ``verified`` although they are not sure, as none is."""
 
     @property
     def names(self) -> list[str]:
@@ -133,7 +137,7 @@ def match_all(
         compared = ImagePairs(pycolmap, cameras, features, usable, gravity, how.matching, frozenset(promising))
         every = len(views) <= MAX_EXHAUSTIVE
         pairs = list(combinations(range(len(views)), 2)) if every else _pairs(features, NEIGHBOURS, ALIKE)
-        found, at_one_place, one_thing = _compared(database, ids, compared, pairs, tell)
+        found, at_one_place, sureness = _compared(database, ids, compared, pairs, tell)
     whole = path.with_name(f"{path.stem}_whole.db")
     try:
         for left in folder.glob(f"{whole.name}-*"):  # of a run that was killed
@@ -141,8 +145,11 @@ def match_all(
         shutil.copyfile(path, whole)  # else what follows would be found already when the map is made again
     except OSError as error:
         raise StoppedError(f"{whole}: cannot be written ({reason(error)}); {advice('go on')}.") from None
+    panoramas = all(isinstance(camera, Equirectangular) for camera in cameras)
+    none_sure = not panoramas and max(sureness.values(), default=SURE) < SURE
+    sure = {pair: one for pair, one in found.items() if none_sure or sureness[pair] >= SURE}
     with _database(pycolmap, whole) as database:
-        between = _with_images_between(database, ids, compared, _agreeing(found), at_one_place, tell)
+        between = _with_images_between(database, ids, compared, _agreeing(sure), at_one_place, tell)
     names = [view.name for view in views]
     matched = Matched(
         database=whole,
@@ -150,10 +157,12 @@ def match_all(
         cameras=dict(zip(names, cameras, strict=True)),
         bearings=dict(zip(names, compared.bearings, strict=True)),
         bound_rad=compared.bound_rad,
-        verified={**found, **between},
+        verified={**sure, **between},
         agreed=_agreeing(between),
-        one_thing=one_thing,
+        unsure={pair: one for pair, one in found.items() if pair not in sure},
+        sureness=sureness,
         same_place=_counts(at_one_place, len(views)),
+        none_sure=none_sure,
     )
     if matched.counts().max(initial=0) < MIN_MATCHES:
         raise InputError(_why_none(matched))
@@ -171,8 +180,8 @@ def _why_none(matched: Matched) -> str:
             f"{advice('moves along')}."
         )
     why = f"the best pair has {matched.counts().max(initial=0)} matches that fit together, but {MIN_MATCHES} are needed"
-    if matched.one_thing:
-        most = max(len(geometry.inlier_matches) for geometry in matched.one_thing.values())
+    if matched.unsure:
+        most = max(len(geometry.inlier_matches) for geometry in matched.unsure.values())
         why = f"up to {most} matches of a pair fit together, but in one part of the view, as of a thing at two places"
     return (
         f"no two of the {count} photographs surely show the same place from two positions: {why}. Take them "
@@ -266,9 +275,8 @@ def _camera_in(pycolmap: Any, database: Any, camera: Camera) -> tuple[int, int]:
 
 def _compared(
     database: Any, ids: Sequence[int], compared: ImagePairs, waiting: Sequence[Pair], tell: Tell
-) -> tuple[dict[Pair, Any], dict[Pair, Any], dict[Pair, Any]]:
-    """The geometry of pairs, that of pairs taken from one place, and that of pairs that may show one thing at two
-    places, which are in neither.
+) -> tuple[dict[Pair, Any], dict[Pair, Any], dict[Pair, float]]:
+    """The geometry of pairs, that of pairs taken from one place, which is not among it, and how sure the others are.
 
     The matches are written into the database.
     """
@@ -286,12 +294,9 @@ def _compared(
         done += 1
         tell("pairs of images matched", done, len(waiting))
     same_place = {pair: found.pop(pair) for pair in sorted(found) if compared.same_place(found[pair])}
-    one_thing = {
-        pair: geometry
-        for pair, geometry in found.items()
-        if compared.on_one_thing(*pair, database.read_matches(*_of(ids, pair)), geometry)
-    }
-    return {pair: found[pair] for pair in found if pair not in one_thing}, same_place, one_thing
+    matches = {pair: database.read_matches(*_of(ids, pair)) for pair in found}
+    sure = dict(as_completed(lambda pair: compared.sureness(*pair, matches[pair], found[pair]), list(found)))
+    return found, same_place, sure
 
 
 def _with_images_between(

@@ -80,6 +80,8 @@ class Reconstruction:
     """Whether maps of single cameras were joined by the images that these took together (``rig``)."""
     joints: tuple[tuple[str, str], ...] = ()
     """Names of the pairs of images each of which alone joins two parts of the model (``joining``)."""
+    unsure: bool = False
+    """Whether it is made of pairs of images that are not sure, as none is (``ImagePairs.sureness``)."""
 
     def without(self, names: Collection[str]) -> "Reconstruction":
         """The model without the images ``names``, and without points that fewer than two of the other images see."""

@@ -13,12 +13,13 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.consensus.spread import spread_of
 from spherloc.geometry import transform
 from spherloc.mapping.level_pairs import chance_of_fit, fitting
 from spherloc.mapping.matched import Matched, Names
 from spherloc.mapping.model import Reconstruction
-from spherloc.mapping.pairs import relative
+from spherloc.mapping.pairs import SURE, relative
 from spherloc.types import BoolArray, FloatArray
 
 NOISE_RAD, MAX_SPREAD = float(np.radians(0.3)), 0.15
@@ -45,14 +46,14 @@ class VerifiedPair:
     """Unit vector (3,) in the second camera's frame: the translation without its length."""
     matches: NDArray[np.int64]
     """(M, 2) indices of the features of both images that fit."""
-    one_thing: bool
-    """Whether the two-view check took it for one thing that may stand at two places."""
+    sureness: float
+    """``ImagePairs.sureness``."""
 
     def turned_round(self) -> "VerifiedPair":
         """The same with the second image as the first."""
         rotation = self.rotation.T
         return VerifiedPair(
-            (self.names[1], self.names[0]), rotation, -rotation @ self.direction, self.matches[:, ::-1], self.one_thing
+            (self.names[1], self.names[0]), rotation, -rotation @ self.direction, self.matches[:, ::-1], self.sureness
         )
 
 
@@ -64,17 +65,21 @@ class PairEvidence:
         names = matched.names
         self.pairs = [
             VerifiedPair(
-                (names[one], names[other]), *relative(found), np.asarray(found.inlier_matches, np.int64), one_thing
+                (names[one], names[other]),
+                *relative(found),
+                np.asarray(found.inlier_matches, np.int64),
+                matched.sureness.get((one, other), SURE),
             )
-            for one_thing, pairs in ((True, matched.one_thing), (False, matched.verified))
-            for (one, other), found in pairs.items()
+            for (one, other), found in {**matched.unsure, **matched.verified}.items()
         ]
         self._bearings, self._cameras = matched.bearings, matched.cameras
+        self.panoramas = all(isinstance(camera, Equirectangular) for camera in matched.cameras.values())
+        """Whether all images see all around."""
         self._matches, self._bound_rad = matched.matches(), matched.bound_rad
         self._telling = [
             pair
             for pair in self.pairs
-            if not pair.one_thing
+            if pair.sureness >= SURE
             and self.share(pair) >= OWN
             and self.share(pair) * len(self._rays(*pair.names)[0]) >= MIN_TELLING
         ]
@@ -157,7 +162,7 @@ class Between:
     """How many more matches of two images fit than do by chance."""
     radius_deg: float
     """Mean over the images of the part of the view with nine tenths of the matches that fit (``Spread.radius_deg``), of
-    that set where it is larger."""
+    that set where it is larger; 0 without panoramas."""
 
     def added_to(self, counts: NDArray[np.int64], ids: Mapping[str, int]) -> NDArray[np.int64]:
         """Numbers of matches (V, V) of all images ``ids`` with those of these pairs."""

@@ -39,7 +39,7 @@ ONE_PLACE_RAD = float(np.radians(0.5))
 LEVEL_BOUND_RAD = float(np.radians(1.2))
 """Largest angle of a match to its epipolar plane where gravity is used: it is known to a degree or less."""
 PEAK = 1.7
-"""Least ratio of the matches that fit a direction found through a third image to those that fit other directions."""
+"""Least peak (``ImagePairs.peak``) of a direction found through a third image."""
 LEAN_RAD = float(np.radians(1.5))
 """Angle by which the gravities of two images may differ under their relative pose, besides the bounds on gravity."""
 MANY_FIT, MIN_RATIO = 55, 1.0 / 3.0
@@ -48,6 +48,9 @@ one thing that stands at two places: so it is with all pairs whose pose is wrong
 with few of the others."""
 MANY_FIT_LEARNED = 250
 """The first of them where LightGlue matches, too, which finds many more on things that look alike."""
+SURE = 200.0
+"""Of other images, which share a part of their view only, a pose is sure if so many matches fit it, times the cube of
+its peak: 60 matches with a peak of 1.5, or 25 with one of 2. ``benchmarks.headset --pairs`` shows why."""
 FAR = 1.0 / 3.0
 """Share of the matches that fit a rotation alone, from which on they may hide where the camera went."""
 NOT_FAR = 3.0
@@ -139,22 +142,39 @@ class ImagePairs:
         more = guided_matches(rays, words, *pose, self.bound_rad)
         if len(more) < MIN_MATCHES:
             return None
-        # On floors and wallpaper as many matches fit whatever the direction to the second camera is.
-        for other in elsewhere(pose):
-            if PEAK * len(guided_matches(rays, words, pose[0], other, self.bound_rad)) > len(more):
-                return None
+        if self._peak(pair, pose, len(more)) < PEAK:
+            return None
         geometry = self._estimated(first, second, more)
         if not self._usable(geometry) or self.same_place(geometry) or not self._level(first, second, geometry):
             return None
         off = rotation_angle(relative(geometry)[0] @ pose[0].T)
         return geometry if off <= OFF_RAD else None
 
-    def on_one_thing(self, first: int, second: int, pairs: NDArray[np.uint32], geometry: Any) -> bool:
-        """Whether what fits of the matches (M, 2) may be a thing that stands at two places."""
-        rays = self.bearings[first][pairs[:, 0]], self.bearings[second][pairs[:, 1]]
-        fits = fitting(*rays, *relative(geometry), self.bound_rad)
-        many = MANY_FIT_LEARNED if self._learned(first, second) else MANY_FIT
-        return fit_on_one_thing((self._cameras[first], self._cameras[second]), rays, fits, many)
+    def sureness(self, first: int, second: int, pairs: NDArray[np.uint32], geometry: Any) -> float:
+        """How sure a pose is; it should be ``SURE``.
+
+        Of panoramas 0 or infinity: whether what fits of the matches (M, 2) may be a thing that stands at two places. Of
+        others the number of those that fit, times the cube of the peak.
+        """
+        rays, pose = self._rays(first, second, pairs), relative(geometry)
+        fits = fitting(*rays, *pose, self.bound_rad)
+        cameras = self._cameras[first], self._cameras[second]
+        if all(isinstance(camera, Equirectangular) for camera in cameras):
+            many = MANY_FIT_LEARNED if self._learned(first, second) else MANY_FIT
+            return 0.0 if fit_on_one_thing(cameras, rays, fits, many) else np.inf
+        return np.count_nonzero(fits) * self.peak(first, second, pose) ** 3
+
+    def peak(self, first: int, second: int, pose: Relative) -> float:
+        """How many times as many guided matches fit a pose as one with another direction to the second camera."""
+        rays, words = (self.bearings[first], self.bearings[second]), (self._words[first], self._words[second])
+        return self._peak((first, second), pose, len(guided_matches(rays, words, *pose, self.bound_rad)))
+
+    def _peak(self, pair: Pair, pose: Relative, count: int) -> float:
+        """``peak`` of a pose that ``count`` guided matches fit. On floors and wallpaper it is near 1."""
+        first, second = pair
+        rays, words = (self.bearings[first], self.bearings[second]), (self._words[first], self._words[second])
+        others = [guided_matches(rays, words, pose[0], way, self.bound_rad) for way in elsewhere(pose)]
+        return count / max(1, *map(len, others))
 
     def _geometry(self, first: int, second: int, pairs: NDArray[np.uint32]) -> Any:
         if len(pairs) < MIN_MATCHES:

@@ -6,9 +6,9 @@ poster or a floor that looks the same elsewhere.
 
 Where places look alike, a map may take two for one (see ``model``). A second map is made from the strong pairs alone,
 and the one with more images in all its parts, minus a penalty for contradictions, is taken. Where contradictions cut a
-map of panoramas, both are made again without the pairs that had joined its parts. Where cameras took images together,
-maps of each by itself are another candidate, joined by these images (see ``rig``). What is still apart of panoramas is
-joined by single pairs (see ``joining``).
+map, both are made again without the pairs that had joined its parts. Where cameras took images together, maps of each
+by itself are another candidate, joined by these images (see ``rig``). What is still apart is joined by single pairs
+(see ``joining``), but for images of several cameras that are no panoramas.
 """
 
 import shutil
@@ -81,7 +81,7 @@ def reconstruct(
     if rigid:
         counts = matched.counts()
         left = replace(left, same_place=with_ties(counts + matched.same_place, matched.names, shots) - counts)
-    made, evidence = [rigid], PairEvidence(matched) if panoramas else None
+    made, evidence = [rigid], PairEvidence(matched) if panoramas or not shots else None
     for _ in range(ROUNDS):
         cut = set[Names]()
         for keep in (0.0, STRONG):
@@ -101,7 +101,8 @@ def reconstruct(
         )
     # Most images in all, then in one map, then those by strong pairs.
     best = max(reversed(candidates), key=lambda models: (sum(map(worth, models)), worth(models[0])))
-    return best if evidence is None else joined_by_pairs(best, matched, evidence, tell)
+    found = best if evidence is None else joined_by_pairs(best, matched, evidence, tell)
+    return tuple(replace(one, unsure=matched.none_sure) for one in found)
 
 
 def _rigid(

@@ -30,6 +30,7 @@ UP = np.array([0.0, 0.0, 1.0])
 """In every map that is written."""
 MOST_ABOVE = 0.65
 """If more of the points are above the cameras, stated gravity may point up."""
+_UNSURE = "hardly more matches fit the poses of two images than other poses; images closer to each other are surer"
 
 
 def summary(made: Map, found: Photographs) -> list[str]:
@@ -65,6 +66,8 @@ def summary(made: Map, found: Photographs) -> list[str]:
             f"on its own    {len(group.written.poses)} images that could not be joined{other_units(group, made)}: "
             f"{group.written.scene}"
         )
+    if made.made.unsure:
+        lines.append(f"in doubt      {_UNSURE}")
     if made.opposed:
         lines.append(f"in doubt      {_opposed_words(*made.opposed)}")
     if made.made.contradictions:
@@ -208,6 +211,8 @@ def _doubts(made: Map) -> list[str]:
     said = [f'<p class="out">Images {html.escape(_far_words(far))}.</p>'] if far else []
     if made.opposed:
         said.append(f'<p class="out">In doubt: {html.escape(_opposed_words(*made.opposed))}.</p>')
+    if made.made.unsure:
+        said.append(f'<p class="out">In doubt: {_UNSURE}.</p>')
     if not against:
         return said
     pairs = "; ".join(f"{first} and {second}" for first, second in against[:10])

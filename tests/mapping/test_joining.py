@@ -100,7 +100,7 @@ class Rooms:
         }
         none = np.zeros((len(names), len(names)), np.int64)
         cameras, bearings = dict.fromkeys(names, PANORAMA), {name: self.bearings[name] for name in names}
-        return Matched(self.path, self.ids, cameras, bearings, BOUND_RAD, verified, verified, {}, none)
+        return Matched(self.path, self.ids, cameras, bearings, BOUND_RAD, verified, verified, {}, {}, none)
 
     def model_of(self, room: str, scale: float, turn: np.ndarray) -> Reconstruction:
         """A map of one room in a frame of its own."""

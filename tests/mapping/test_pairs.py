@@ -1,19 +1,21 @@
-"""Pairs of panoramas: a pose that neither clouds nor wind hide, and which pairs LightGlue matches."""
+"""Pairs of images: a pose that neither clouds nor wind hide, which is sure, and which pairs LightGlue matches."""
 
 import numpy as np
 import pycolmap
 import pytest
 
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.errors import InputError
 from spherloc.frontend.features import Features, _joined
 from spherloc.frontend.matching import MatchOptions
 from spherloc.frontend.view import Gravity
 from spherloc.geometry import DOWN, pose, rotation_angle, so3_exp, transform, yaw_rotation
-from spherloc.mapping.pairs import ImagePairs, relative
+from spherloc.mapping.pairs import SURE, ImagePairs, relative
 from spherloc.mapping.telling import below_sky, far_rotation, unmoved
 
 CAMERA = Equirectangular(2048, 1024)
+FISHEYE = KannalaBrandt(800, 800, 250.0, 250.0, 400.0, 400.0, (0.0,) * 4)
 BOUND = np.radians(0.5)
 LEVEL = (DOWN, DOWN)
 
@@ -40,13 +42,13 @@ def street(rng, near, sky, wind_deg=0.0, wrong=40):
     return here, unit(np.concatenate(there)), second
 
 
-def two_images(rng, here, there, parts=1, matching=None, promising=()):
+def two_images(rng, here, there, parts=1, matching=None, promising=(), words=None, camera=CAMERA):
     """``ImagePairs`` of two images whose feature number i is at the bearing number i of each, in as many kinds."""
-    words = rng.normal(size=(len(here), 128)).astype(np.float32)
+    words = rng.normal(size=(len(here), 128)).astype(np.float32) if words is None else words
     ones = np.ones(len(here))
 
     def image(rays):
-        pixels, _ = CAMERA.project(rays)
+        pixels, _ = camera.project(rays)
         kinds = [
             Features(pixels.copy(), 3.0 * ones, 0.0 * ones, ones.copy(), words.copy(), kind, (2048, 1024))
             for kind in ("sift", "aliked")[:parts]
@@ -56,7 +58,7 @@ def two_images(rng, here, there, parts=1, matching=None, promising=()):
     every = np.arange(parts * len(here))
     gravity = [Gravity(DOWN, np.radians(0.5))] * 2
     features = [image(here), image(there)]
-    return ImagePairs(pycolmap, [CAMERA] * 2, features, [every] * 2, gravity, matching or MatchOptions(), promising)
+    return ImagePairs(pycolmap, [camera] * 2, features, [every] * 2, gravity, matching or MatchOptions(), promising)
 
 
 def test_far_matches_turn_alike(rng):
@@ -104,6 +106,21 @@ def test_a_pose_of_drifting_clouds_is_none(rng):
     here, there, _ = street(rng, 0, 240, wind_deg=4.0, wrong=60)
     _, geometry = two_images(rng, here, there).compare(0, 1)
     assert geometry is None
+
+
+@pytest.mark.parametrize(("right", "alike", "unsure"), [(45, 0, False), (45, 400, True), (150, 400, False)])
+def test_a_pose_of_fisheyes_is_sure_if_no_other_direction_has_nearly_as_many_matches(rng, right, alike, unsure):
+    """Floors and wallpaper, where each feature has many like it, match whatever the direction is."""
+    count, second = right + alike, pose(yaw_rotation(0.3), [0.5, 0.0, 0.2])
+    things = rng.uniform([-4.0, -3.0, 2.0], [4.0, 3.0, 6.0], (count, 3))
+    there = np.concatenate([transform(second, things[:right]), rng.uniform([-4, -3, 2], [4, 3, 6], (alike, 3))])
+    words = rng.normal(size=(count, 128)).astype(np.float32)
+    words[right:] = rng.normal(size=128) + 0.2 * rng.normal(size=(alike, 128))
+    pair = two_images(rng, things, there, words=words, camera=FISHEYE)
+    geometry = pair._estimated(0, 1, np.tile(np.arange(right, dtype=np.uint32)[:, None], 2))
+    matches = np.tile(np.arange(count, dtype=np.uint32)[:, None], 2)
+    assert rotation_angle(relative(geometry)[0] @ second[:, :3].T) < np.radians(0.2)
+    assert bool(pair.sureness(0, 1, matches, geometry) < SURE) is unsure
 
 
 def test_lightglue_matches_promising_pairs_only(rng, tmp_path):
