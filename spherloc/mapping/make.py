@@ -14,6 +14,7 @@ from spherloc.mapping.carried import carried_nadir_deg
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.line_gravity import GravityByLines, gravity_by_lines
 from spherloc.mapping.matched import DATABASES
+from spherloc.mapping.misplaced import far_off
 from spherloc.mapping.model import Reconstruction
 from spherloc.mapping.new_images import NewImages
 from spherloc.mapping.parallel import Tell
@@ -218,13 +219,13 @@ def _finished(
     tell: Tell,
 ) -> tuple[Reconstruction, Level, MapScale]:
     """A model with images added later and without those whose own gravity, or what another camera took together with
-    them, disagrees; its gravity and its scale."""
+    them, disagrees, and those far off; its gravity and its scale."""
     shots = shots_of(views)
     made = made.without(level_of(made.poses, gravity).leaning)
-    made = made.without(misfits(made.poses, shots))
+    made = made.without(misfits(made.poses, shots) | far_off(made.poses))
     made = place_rest(made, views, elsewhere, gravity, level_of(made.poses, gravity), tell)
     level = level_of(made.poses, gravity)
-    made = made.without(level.leaning.keys() | misfits(made.poses, shots))
+    made = made.without(level.leaning.keys() | misfits(made.poses, shots) | far_off(made.poses))
     return made, level, scale_of(made, level, measured)
 
 

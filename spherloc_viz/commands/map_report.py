@@ -292,8 +292,8 @@ def why_not(made: Map, names: list[str], index: int) -> str:
             f"the map has {MIN_MATCHES} matches with it that fit together: take images in between."
         )
     return (
-        f"It has {counts[best]} matches with {names[best]}, too few of which have a point in the map: take "
-        "one more image near it."
+        f"It has {counts[best]} matches with {names[best]}, too few of which tell where in the map it "
+        "is: take one more image near it."
     )
 
 

@@ -36,7 +36,7 @@ from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.line_gravity import gravity_by_lines
 from spherloc.mapping.make import MapRequest, ScaleMeasurement, make_map, scale_of
-from spherloc.mapping.misplaced import without_misplaced
+from spherloc.mapping.misplaced import far_off, without_misplaced
 from spherloc.mapping.new_images import NewImages, new_images_of
 from spherloc.mapping.new_queries import add_new_images, map_images
 from spherloc.mapping.photographs import Photographs, _is_in, photographs, two_circles
@@ -759,6 +759,17 @@ def test_a_lens_that_colmap_lacks_is_fitted():
     bent = Mei(640, 480, 300.0, 300.0, 320.0, 240.0, 0.5, (0.0, 0.0, 0.05, 0.05))
     with pytest.raises(CalibrationError, match="no camera model mei"):
         for_colmap(bent)
+
+
+def test_images_far_from_all_others_are_named():
+    """One that is three times as far from the nearest as any two others are from each other; of few images none."""
+    poses = {f"{at}.png": np.column_stack([np.eye(3), [-at, 0.0, 0.0]]) for at in (0.0, 1.0, 2.0, 3.0, 5.0, 7.0, 30.0)}
+    assert far_off(poses) == {"30.0.png"}
+    poses["-200.png"] = np.column_stack([np.eye(3), [0.0, 200.0, 0.0]])
+    assert far_off(poses) == {"30.0.png", "-200.png"}
+    near = {name: pose for name, pose in poses.items() if name not in ("30.0.png", "-200.png")}
+    assert far_off(near | {"10.0.png": np.column_stack([np.eye(3), [-27.0, 0.0, 0.0]])}) == set()
+    assert far_off({name: poses[name] for name in ("0.0.png", "1.0.png", "2.0.png", "30.0.png")}) == set()
 
 
 def test_an_image_that_stands_otherwise_than_its_pairs_say_is_left_out(walk):
