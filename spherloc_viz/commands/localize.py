@@ -41,7 +41,7 @@ from spherloc_viz.commands.flags import RECORDINGS
 from spherloc_viz.commands.progress import prepare, progress, say
 from spherloc_viz.commands.run import Records, parse_settings, store_of
 from spherloc_viz.commands.sequence_comparison import Compared, write_comparison
-from spherloc_viz.commands.sequence_text import sequence_text
+from spherloc_viz.commands.sequence_text import maps_text, sequence_text
 from spherloc_viz.options import json_text
 from spherloc_viz.recording.origin import Origin
 
@@ -115,6 +115,8 @@ def localize_in_maps(solvings: Mapping[Path, Solving]) -> int:
                 _finish(log, found, one.scene, one.backdrop)
             one.results[0] = found
         print(sequence_text(found, summarize(found), one.scene), flush=True)
+    if len(done) > 1:
+        print(maps_text([one.results[0] for one in done.values()]), flush=True)
     sure = {row.query for one in done.values() for row in one.results[0].rows if row.status == LOCALIZED}
     return 0 if all(one.chosen <= sure for one in done.values()) else 1
 

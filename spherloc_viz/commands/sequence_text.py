@@ -1,6 +1,6 @@
 """What ``spherloc localize`` prints of a sequence."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from statistics import median
 
 from spherloc.datasets.map_scene import LIKE_REFERENCE, MapScene
@@ -70,6 +70,29 @@ def sequence_text(results: SequenceResults, summary: Summary, scene: MapScene) -
     if (picture := results.folder / PICTURE).exists():
         lines.append(f"  picture: {picture}")
     return "\n".join([*lines, f"  written to {results.folder}"])
+
+
+def maps_text(results: Sequence[SequenceResults]) -> str:
+    """In which of several maps each of the same queries is localized, as text for users.
+
+    ``results`` are those in each of the maps.
+    """
+    localized = [{row.query for row in one.rows if row.status == LOCALIZED} for one in results]
+    queries = {row.query for one in results for row in one.rows}
+    anywhere = set().union(*localized)
+    lines = [f"{len(anywhere)} of {len(queries)} queries are localized in one of these {len(results)} maps"]
+    lines += [
+        f"  {len(names)} in {one.configuration.scene}{_names(names)}"
+        for one, names in zip(results, localized, strict=True)
+    ]
+    if left := queries - anywhere:
+        lines.append(f"  {len(left)} in none{_names(left)}")
+    return "\n".join(lines)
+
+
+def _names(names: Collection[str]) -> str:
+    said = sorted(names)
+    return f": {', '.join(said[:MAX_EACH])}{', …' if len(said) > MAX_EACH else ''}" if said else ""
 
 
 def _wrong(results: SequenceResults) -> Iterator[str]:
