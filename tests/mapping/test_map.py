@@ -32,6 +32,7 @@ from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.advice import COMMAND, PAGE, for_a_page
 from spherloc.mapping.frames import frames_of
+from spherloc.mapping.full_panorama import two_circles
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.line_gravity import gravity_by_lines
@@ -39,7 +40,7 @@ from spherloc.mapping.make import MapRequest, ScaleMeasurement, make_map, scale_
 from spherloc.mapping.misplaced import without_misplaced
 from spherloc.mapping.new_images import NewImages, new_images_of
 from spherloc.mapping.new_queries import add_new_images, map_images
-from spherloc.mapping.photographs import Photographs, _is_in, photographs, two_circles
+from spherloc.mapping.photographs import Photographs, _is_in, photographs
 from spherloc.mapping.scene_files import (
     MODEL,
     SCENE,
