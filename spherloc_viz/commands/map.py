@@ -33,6 +33,7 @@ from spherloc.frontend.view import View
 from spherloc.images import check_image, read_size
 from spherloc.mapping.advice import advice, for_a_page
 from spherloc.mapping.frames import FRAMES, FrameChoice, frames_of
+from spherloc.mapping.gravity_check import check_stated
 from spherloc.mapping.kept_scale import FILE as SCALE_FILE
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
 from spherloc.mapping.make import Map, MapRequest, ScaleMeasurement, make_map
@@ -117,7 +118,8 @@ def make(
         unscaled = measured == ScaleMeasurement()
         data = sequence_data(folder, found.views, gravity=gravity is None, positions=unscaled)
         stated = stated or data.stated
-        for remark in (*found.remarks, *(() if stated is None else stated.remarks), *data.remarks):
+        against = [] if stated is None else check_stated(stated, found.views, tell)
+        for remark in (*found.remarks, *(() if stated is None else stated.remarks), *data.remarks, *against):
             say(remark)
         others = None
         if new_images is not None:

@@ -194,7 +194,7 @@ def test_gravity_that_a_file_states_goes_before_that_of_lines(walk, tmp_path):
     assert alone.source == "the gravity file of 1 image" and not alone.by_lines
 
     (tmp_path / "none.txt").write_text("else.png 0 1 0")
-    with pytest.raises(InputError, match=r"none.txt: has gravity of none of the 5 photographs; name them as"):
+    with pytest.raises(InputError, match=r"none of the 5 photographs; it names 'else.png'; .* such as 'reference_0"):
         read_stated_gravity(tmp_path / "none.txt", None, found.views)
 
 
