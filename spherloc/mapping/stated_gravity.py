@@ -29,7 +29,9 @@ class StatedGravity:
     """Sentences on what does not fit together."""
     in_map_folder: bool = False
     """Whether a gravity file of them is written for the scenes of the map, as ``file`` is the log of an IMU that
-    several cameras are fixed to."""
+    several cameras are fixed to, or since it is from tags."""
+    lines_agree: bool = False
+    """Whether vertical lines agree with it, so that those of queries are searched where nothing is stated."""
 
     @property
     def is_gravity_file(self) -> bool:

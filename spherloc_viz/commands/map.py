@@ -59,6 +59,7 @@ from spherloc.mapping.scene_files import (
 )
 from spherloc.mapping.sequence import sequence_data
 from spherloc.mapping.stated_gravity import read_stated_gravity
+from spherloc.mapping.tag_gravity import stated_by_tags
 from spherloc.mapping.true_poses import truth_words
 from spherloc.registry import require
 from spherloc.types import FloatArray
@@ -119,11 +120,13 @@ def make(
         data = sequence_data(folder, found.views, gravity=gravity is None, positions=unscaled)
         stated = stated or data.stated
         against = [] if stated is None else check_stated(stated, found.views, tell)
+        if stated is None:
+            stated, against = stated_by_tags(found.views, tell)
         for remark in (*found.remarks, *(() if stated is None else stated.remarks), *data.remarks, *against):
             say(remark)
         others = None
         if new_images is not None:
-            others, remarks = new_images_of(new_images, found, panorama, choice, imu=gravity is None)
+            others, remarks = new_images_of(new_images, found, panorama, choice, measured_gravity=gravity is None)
             for remark in remarks:
                 say(f"{new_images}: {remark}")
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
