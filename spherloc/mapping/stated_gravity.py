@@ -32,6 +32,8 @@ class StatedGravity:
     several cameras are fixed to, or since it is from tags."""
     lines_agree: bool = False
     """Whether vertical lines agree with it, so that those of queries are searched where nothing is stated."""
+    doubts: tuple[str, ...] = ()
+    """Sentences on how it contradicts the photographs (``gravity_check``)."""
 
     @property
     def is_gravity_file(self) -> bool:

@@ -13,7 +13,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -119,10 +119,13 @@ def make(
         unscaled = measured == ScaleMeasurement()
         data = sequence_data(folder, found.views, gravity=gravity is None, positions=unscaled)
         stated = stated or data.stated
-        against = [] if stated is None else check_stated(stated, found.views, tell)
+        about_gravity: Sequence[str] = ()
         if stated is None:
-            stated, against = stated_by_tags(found.views, tell)
-        for remark in (*found.remarks, *(() if stated is None else stated.remarks), *data.remarks, *against):
+            stated, about_gravity = stated_by_tags(found.views, tell)
+        else:
+            stated = replace(stated, doubts=tuple(check_stated(stated, found.views, tell)))
+            about_gravity = stated.doubts
+        for remark in (*found.remarks, *(() if stated is None else stated.remarks), *data.remarks, *about_gravity):
             say(remark)
         others = None
         if new_images is not None:

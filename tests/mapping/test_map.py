@@ -182,6 +182,9 @@ def test_gravity_that_a_file_states_goes_before_that_of_lines(walk, tmp_path):
     assert "in doubt" not in "".join(summary(made, found))
     up = replace(made, written=replace(made.written, points=made.written.points * [1.0, 1.0, -1.0] + [0.0, 0.0, 9.0]))
     assert "of the points are above the cameras; the stated gravity must point down" in "".join(summary(up, found))
+    doubted = replace(made, doubts=("gravity.txt: its gravity points <up>.",))
+    assert "in doubt      gravity.txt: its gravity points <up>." in summary(doubted, found)
+    assert '<p class="out">In doubt: gravity.txt: its gravity points &lt;up&gt;.</p>' in map_report(doubted, found)
     page = map_report(made, found)
     assert "<td>the gravity file, at most 1.5° off</td>" in page and "<td>lines of the image, at most " in page
     for name in names:
