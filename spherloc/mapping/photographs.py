@@ -275,8 +275,8 @@ def _of_folder(
     lens: CalibratedLens | None = None
     if rest and panorama and of_map is None and not camera_of and not given:
         raise InputError(
-            f"{folder}: its photographs, {_told(sizes)}, are no full panoramas, which --panorama is for: these are "
-            "twice as wide as high; have them stitched to the whole sphere, or make the map without that option."
+            f"{folder}: its photographs, {_told(sizes)}, are no full panoramas, which are twice as wide as high; "
+            f"{advice('no panoramas')}."
         )
     if rest and not camera_of and not given:
         order = sorted(sizes, key=lambda size: -len(sizes[size]))
