@@ -10,6 +10,7 @@ COMMAND = {
     "two circles": "have the camera's own program stitch them, or cut each in two, a folder for each lens; give "
     "--panorama if they are panoramas",
     "sphere": "they count as other photographs; --panorama takes them for panoramas",
+    "resized": "give them as the camera has them, or --panorama if they were resized and show the whole sphere",
     "no panoramas": "have them stitched to the whole sphere, or make the map without --panorama",
     "moves along": "leave it out with --mask or --nadir",
     "carried": " (--nadir 0: not)",
@@ -31,6 +32,7 @@ PAGE = {
     "which camera": "to choose, name the images or their folder after their camera",
     "two circles": "have the camera's own program stitch them, or cut each in two, a folder for each lens",
     "sphere": "they count as other photographs",
+    "resized": "give them as the camera has them",
     "no panoramas": "have them stitched to the whole sphere",
     "moves along": "take photographs without it, or make the map with the command spherloc map, which takes masks",
     "carried": "",

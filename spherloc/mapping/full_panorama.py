@@ -45,6 +45,8 @@ class FullPanoramas:
     names: Sequence[str]
     raw: Sequence[str]
     """Names of those with the circles of two lenses."""
+    resized: Sequence[str]
+    """Names of those like panoramas, but too far from 2 to 1: no lens is to be sought in them."""
     remarks: Sequence[str]
     """Why the others are none, or what is assumed, in sentences."""
 
@@ -60,21 +62,21 @@ def full_panoramas(folder: Path, names: Sequence[str], size: tuple[int, int], *,
     others = [name for name in names if name not in raw]
     images = f"{len(others)} image{'s'[: len(others) != 1]} of {width} x {height} pixels"
     if not others:
-        return FullPanoramas((), raw, ())
+        return FullPanoramas((), raw, (), ())
     whole = stated or are_full_panoramas([folder / name for name in others], unclear=width == 2 * height)
     if whole and width == 2 * height:
-        return FullPanoramas(others, raw, ())
+        return FullPanoramas(others, raw, (), ())
     if whole and (stated or near_two_to_one(size, NEAR_RATIO)):
         scaled = "though not exactly twice as wide as high: the width has 360°, the height 180°"
-        return FullPanoramas(others, raw, (f"{images}: taken for full panoramas, {scaled}.",))
+        return FullPanoramas(others, raw, (), (f"{images}: taken for full panoramas, {scaled}.",))
     if whole:
-        why = f"{images}: like panoramas, but these are twice as wide as high"
-    elif width == 2 * height:
-        edges = "left and right edges do not continue each other, or upper and lower ones are not one colour each"
-        why = f"{images}: twice as wide as high, but no full panoramas, since {edges}"
-    else:
-        return FullPanoramas((), raw, ())
-    return FullPanoramas((), raw, (f"{why}; {advice('sphere')}.",))
+        why = f"{images}: like panoramas, but these are twice as wide as high; {advice('resized')}."
+        return FullPanoramas((), raw, others, (why,))
+    if width != 2 * height:
+        return FullPanoramas((), raw, (), ())
+    edges = "left and right edges do not continue each other, or upper and lower ones are not one colour each"
+    why = f"{images}: twice as wide as high, but no full panoramas, since {edges}; {advice('sphere')}."
+    return FullPanoramas((), raw, (), (why,))
 
 
 def are_full_panoramas(paths: Sequence[Path], *, unclear: bool = True) -> bool:

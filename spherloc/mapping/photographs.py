@@ -246,6 +246,7 @@ def _of_folder(
     }
     camera_of: dict[str, Camera] = {}
     raw: list[str] = []
+    resized: list[str] = []
     shapes: list[str] = []
     for size, names in sizes.items():
         found, about = _with_cameras(names, size, cameras)
@@ -256,6 +257,7 @@ def _of_folder(
             panoramas = full_panoramas(folder, names, size, stated=panorama)
             found = dict.fromkeys(panoramas.names, Equirectangular(*size))
             raw += panoramas.raw
+            resized += panoramas.resized
             shapes += panoramas.remarks
         camera_of |= found
         remarks += about
@@ -266,11 +268,13 @@ def _of_folder(
     unused = [] if given or used or panorama else beside.unused(sizes)
     remarks += unused
     unusable = bool(unused)
-    if raw and not camera_of and len(raw) == sum(map(len, sizes.values())):
-        raise InputError(f"{folder}: its photographs are raw images of two lenses; {advice('two circles')}.")
     remarks += [*_about_raw(raw), *shapes]
     unused = [*unused, *shapes]
-    sizes = {size: plain for size, names in sizes.items() if (plain := [name for name in names if name not in raw])}
+    no_lens = {*raw, *resized}
+    sizes = {size: plain for size, names in sizes.items() if (plain := [name for name in names if name not in no_lens])}
+    if not sizes and not camera_of:
+        is_raw = f"its photographs are raw images of two lenses; {advice('two circles')}."
+        raise InputError(f"{folder}: {' '.join([*([is_raw] if raw else []), *shapes])}")
     rest = sorted(name for names in sizes.values() for name in names if name not in camera_of)
     lens: CalibratedLens | None = None
     if rest and panorama and of_map is None and not camera_of and not given:
