@@ -1,5 +1,5 @@
-"""The pose that a 360-degree camera writes into its photographs: pitch and roll in an XMP packet, after Google's
-Photo Sphere metadata (https://developers.google.com/streetview/spherical-metadata)."""
+"""What a 360-degree camera writes into its photographs: pitch and roll, and that they are panoramas, in an XMP packet
+after Google's Photo Sphere metadata (https://developers.google.com/streetview/spherical-metadata)."""
 
 import warnings
 from pathlib import Path
@@ -55,28 +55,58 @@ def _packet(path: Path) -> bytes | None:
     return packet.encode() if isinstance(packet, str) else packet
 
 
-def _pitch_and_roll(packet: bytes, place: str) -> tuple[float, float]:
-    """Pitch and roll, degrees; one of them is enough: cameras leave out an angle of 0."""
-    damaged = InputError(f"{place}: its XMP tags are damaged, so that its pitch and roll cannot be read.")
+def says_full_panorama(path: Path) -> bool:
+    """Whether the XMP packet of an image says that it is an equirectangular panorama of the whole sphere.
+
+    Raises ``InputError`` if it cannot be read.
+    """
+    packet = _packet(path)
+    root = None if packet is None else _parsed(packet)
+    if root is None or _value(root, "ProjectionType") != "equirectangular":
+        return False
+    cropped, full = (
+        [_value(root, name) for name in names]
+        for names in (
+            ("CroppedAreaImageWidthPixels", "CroppedAreaImageHeightPixels"),
+            ("FullPanoWidthPixels", "FullPanoHeightPixels"),
+        )
+    )
+    return cropped == full or None in (*cropped, *full)
+
+
+def _parsed(packet: bytes) -> ElementTree.Element | None:
+    """The root of an XMP packet; None if it is damaged."""
     # Declarations could define entities that grow without end or name other files; XMP has none.
     if len(packet) > MAX_BYTES or b"<!" in packet or b"\0" in packet:
-        raise damaged
+        return None
     try:
-        root = ElementTree.fromstring(packet.strip())
+        return ElementTree.fromstring(packet.strip())
     except (ElementTree.ParseError, ValueError, RecursionError, LookupError):
-        raise damaged from None
-    found: dict[str, float] = {}
+        return None
+
+
+def _value(root: ElementTree.Element, name: str) -> str | None:
+    """The last value of a GPano property; None if it has none."""
+    found = None
     for element in root.iter():
-        for name in (_PITCH, _ROLL):
-            text = element.text if element.tag == f"{_GPANO}{name}" else element.get(f"{_GPANO}{name}")
-            if text is not None:
-                (angle,) = finite_numbers([text.strip()], f"{place}, {name}")
-                if abs(angle) > _LIMITS_DEG[name]:
-                    limit = _LIMITS_DEG[name]
-                    raise InputError(
-                        f"{place}: {name} is {show(angle)}; it must be an angle from {-limit:g} to {limit:g}."
-                    )
-                found[name] = angle
+        text = element.text if element.tag == f"{_GPANO}{name}" else element.get(f"{_GPANO}{name}")
+        found = found if text is None else text.strip()
+    return found
+
+
+def _pitch_and_roll(packet: bytes, place: str) -> tuple[float, float]:
+    """Pitch and roll, degrees; one of them is enough: cameras leave out an angle of 0."""
+    root = _parsed(packet)
+    if root is None:
+        raise InputError(f"{place}: its XMP tags are damaged, so that its pitch and roll cannot be read.")
+    found: dict[str, float] = {}
+    for name, limit in _LIMITS_DEG.items():
+        text = _value(root, name)
+        if text is not None:
+            (angle,) = finite_numbers([text], f"{place}, {name}")
+            if abs(angle) > limit:
+                raise InputError(f"{place}: {name} is {show(angle)}; it must be an angle from {-limit:g} to {limit:g}.")
+            found[name] = angle
     if not found:
         raise InputError(f"{place}: its XMP tags hold no pitch and roll ({_PITCH}, {_ROLL}).")
     return found.get(_PITCH, 0.0), found.get(_ROLL, 0.0)

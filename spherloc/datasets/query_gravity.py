@@ -2,7 +2,8 @@
 
 A gravity file has a row ``image gx gy gz [sd_deg]`` a query: its name as the scene has it (in quotation marks where it
 has spaces), a vector that points down in the camera frame, of any length, and the standard deviation of each of its two
-tilts in degrees, a third of the bound. Words are parted by spaces or commas; # begins a comment.
+tilts in degrees, a third of the bound. Words are parted by spaces or commas; # begins a comment. The first row may be
+these titles.
 """
 
 import re
@@ -36,6 +37,8 @@ since 1970 is rounded to a quarter of a microsecond."""
 _MAX_SD_DEG = 25.0
 _ROW = re.compile(r'(?:"([^"]+)"|([^\s,"]+))[\s,]+(.*)')
 _COLUMNS = "image gx gy gz [sd_deg]"
+_TITLES = re.compile(r"(g?)x \1y \1z( (sd|sd_deg))?")
+"""Titles of the columns after the first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,9 +194,11 @@ def read_gravity_file(path: Path) -> dict[str, Gravity]:
     zero, and for an image that is there twice.
     """
     found: dict[str, Gravity] = {}
-    for place, text in rows(path, f"rows of {_COLUMNS}"):
+    for number, (place, text) in enumerate(rows(path, f"rows of {_COLUMNS}")):
         match = _ROW.match(text)
         words = match[3].partition("#")[0].replace(",", " ").split() if match else []
+        if number == 0 and _TITLES.fullmatch(" ".join(words).replace('"', "").lower()):
+            continue
         if match is None or len(words) not in (3, 4):
             raise InputError(f"{place}: is not a row {_COLUMNS}; give a name and three or four numbers.")
         name = match[1] or match[2]

@@ -7,7 +7,11 @@ from contextvars import ContextVar
 COMMAND = {
     "calibration": "put {files} beside them, or give it with --camera FILE",
     "which camera": "to choose, name the images or their folder after their camera, or give --camera-name",
-    "two circles": "have the camera's own program stitch them, or give --panorama if they are panoramas",
+    "two circles": "have the camera's own program stitch them, or cut each in two, a folder for each lens; give "
+    "--panorama if they are panoramas",
+    "sphere": "they count as other photographs; --panorama takes them for panoramas",
+    "resized": "give them as the camera has them, or --panorama if they were resized and show the whole sphere",
+    "no panoramas": "have them stitched to the whole sphere, or make the map without --panorama",
     "moves along": "leave it out with --mask or --nadir",
     "carried": " (--nadir 0: not)",
     "more features": "; with ALIKED and LightGlue beside it: --features sift+aliked",
@@ -26,7 +30,10 @@ COMMAND = {
 PAGE = {
     "calibration": "put {files} beside them, into that folder, and make the map again",
     "which camera": "to choose, name the images or their folder after their camera",
-    "two circles": "have the camera's own program stitch them",
+    "two circles": "have the camera's own program stitch them, or cut each in two, a folder for each lens",
+    "sphere": "they count as other photographs",
+    "resized": "give them as the camera has them",
+    "no panoramas": "have them stitched to the whole sphere",
     "moves along": "take photographs without it, or make the map with the command spherloc map, which takes masks",
     "carried": "",
     "more features": "",

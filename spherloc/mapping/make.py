@@ -94,7 +94,9 @@ class Map:
     """Half the opening angle of the cone around straight down that was left out, since what is in it moves with the
     camera; 0 if nothing was found."""
     stated: Mapping[str, Gravity] = field(default_factory=dict)
-    """Gravity of photographs that a file states, by name."""
+    """Gravity of photographs that a file or their tags state, by name."""
+    doubts: tuple[str, ...] = ()
+    """Sentences on how that contradicts the photographs."""
     opposed: tuple[str, str] | None = None
     """Two cameras that took images together, but went different ways in this map, or in it and one of ``groups``."""
 
@@ -159,7 +161,8 @@ def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
     found = _finished(first, views, nearer_to_others(first, others), gravity, measured, tell)
     inside = set(found[0].poses)
     written = write_map(*found, views, request.images, folder, request.new_images, kept)
-    made = Map(*found, written, lines, features=kept.how.features.method, carried_deg=carried_deg, stated=known)
+    method, doubts = kept.how.features.method, () if stated is None else stated.doubts
+    made = Map(*found, written, lines, features=method, carried_deg=carried_deg, stated=known, doubts=doubts)
     groups: list[Map] = []
     for other in others:
         if len(other.poses.keys() - inside) < MIN_OF_GROUP:

@@ -14,6 +14,7 @@ from spherloc.images import read_size
 from spherloc.mapping.frames import FrameChoice
 from spherloc.mapping.photographs import Photographs, cameras_of, with_cameras
 from spherloc.mapping.sequence import sequence_data
+from spherloc.mapping.tag_gravity import stated_by_tags
 from spherloc.mapping.true_poses import GroundTruth, ground_truth
 
 
@@ -25,7 +26,7 @@ class NewImages:
     views: tuple[View, ...] | None
     """With their cameras, named by the path in the folder; None for all images there, of the map's one camera."""
     gravity: Mapping[str, Gravity] = field(default_factory=dict)
-    """That of a sequence's IMU, by name."""
+    """That of a sequence's IMU or of tags, by name."""
     truth: GroundTruth | None = None
     """That of their sequence; None if there is none."""
 
@@ -36,12 +37,12 @@ def new_images_of(
     panorama: bool = False,
     choice: FrameChoice = FrameChoice(),  # noqa: B008 -- frozen
     *,
-    imu: bool = True,
+    measured_gravity: bool = True,
 ) -> tuple[NewImages, tuple[str, ...]]:
     """The images of a folder that are to be localized in the map of others, and remarks on those that cannot be.
 
     Where they are many, those that ``choice`` takes, of a folder whose images were mapped in part the others. With
-    ``imu``, gravity of a sequence is that of its IMU.
+    ``measured_gravity``, gravity is that of a sequence's IMU, or of the tags of panoramas (``stated_by_tags``).
 
     A calibration that lies beside images of its size is theirs, as for a map's own. Without one, they are of a camera
     of the map that has their size, which ``with_cameras`` tells by their names where it has several; others of 2 to 1
@@ -59,9 +60,13 @@ def new_images_of(
         raise InputError(f"{folder}: the camera of none of its images is known. {' '.join(found.remarks)}")
     all_there = only is not None and _all_of(folder, only) == [view.path for view in found.views]
     all_its = only is not None and all(_is(view.camera, only) for view in found.views)
-    data = sequence_data(folder, found.views, gravity=imu, positions=False)
+    data = sequence_data(folder, found.views, gravity=measured_gravity, positions=False)
     gravity = {} if data.stated is None else data.stated.found
     remarks = (*found.remarks, *data.remarks)
+    if measured_gravity and not gravity:
+        stated, about_tags = stated_by_tags(found.views, choice.tell)
+        gravity = {} if stated is None else stated.found
+        remarks = (*remarks, *about_tags)
     truth = ground_truth(folder, found.views, mapped.views)
     return NewImages(folder, None if all_there and all_its else found.views, gravity, truth), remarks
 

@@ -5,8 +5,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
@@ -18,19 +16,14 @@ from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
-from spherloc.images import check_image, grey, read_eighth, read_image
+from spherloc.images import check_image
 from spherloc.mapping.advice import advice
 from spherloc.mapping.frames import MAX_IMAGES, FrameChoice, ImageFolder, chosen
-from spherloc.mapping.image_circle import BLACK
+from spherloc.mapping.full_panorama import full_panoramas, near_two_to_one
 from spherloc.mapping.lens import for_colmap
 from spherloc.trajectory import NS_PER_S
-from spherloc.types import ByteArray
 
 MIN_IMAGES = 2
-MIN_PANORAMA_PX = 200
-"""Least length of the longer side of a panorama."""
-MIN_REDUCED_PX = 1024
-"""Least height of an image that is seen well enough at an eighth of its size."""
 UNREAD = {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gpr", ".heic", ".heif", ".insp", ".nef", ".orf", ".raf", ".rw2"}
 """Endings of photographs that OpenCV does not read."""
 MAX_NAMED = 3
@@ -107,9 +100,10 @@ def with_cameras(
     ``cameras`` are those of a calibration file, by name; without them, calibrations beside the images are taken, and
     for a folder in ``folder`` also one beside it that has its name, or a file there with several cameras. A single
     camera is that of all images. Of several with the size of an image it is the one whose name is in the image's name,
-    or that of its folder; a camera that has only a number is that of the folder with this number. Images of 2 to 1
-    count as panoramas where no camera has their size, and if ``panorama`` in any case. If no camera is known of the
-    images of a folder, ``find_lens`` calibrates that of those of one size, the most frequent.
+    or that of its folder; a camera that has only a number is that of the folder with this number. Images of about
+    2 to 1 count as panoramas where no camera has their size, if they show the whole sphere (``are_full_panoramas``) or
+    with ``panorama``. If no camera is known of the images of a folder, ``find_lens`` calibrates that of those of one
+    size, the most frequent.
 
     Of images that are to be localized in a map, ``of_map`` are the cameras of that, by name; they count for sizes for
     which there is no calibration. Those images may have any camera model, not only one of COLMAP's.
@@ -246,18 +240,25 @@ def _of_folder(
     if not sizes:
         raise InputError(_without_photographs(folder, remarks, of_map is not None))
     cameras = given or {
-        name: camera for name, camera in beside.cameras.items() if not panorama or camera.width != 2 * camera.height
+        name: camera
+        for name, camera in beside.cameras.items()
+        if not (panorama and near_two_to_one((camera.width, camera.height)))
     }
     camera_of: dict[str, Camera] = {}
+    raw: list[str] = []
+    resized: list[str] = []
+    shapes: list[str] = []
     for size, names in sizes.items():
         found, about = _with_cameras(names, size, cameras)
         if of_map:
             others_of_map, about_them = _with_cameras([name for name in names if name not in found], size, of_map)
             found, about = found | others_of_map, about + about_them
-        if not given and not found and size[0] == 2 * size[1] >= MIN_PANORAMA_PX:
-            raw = [name for name in names if not panorama and _is_raw(folder / name, size[1])]
-            found = {name: Equirectangular(*size) for name in names if name not in raw}
-            remarks += _about_raw(raw)
+        if not given and not found and near_two_to_one(size):
+            panoramas = full_panoramas(folder, names, size, stated=panorama)
+            found = dict.fromkeys(panoramas.names, Equirectangular(*size))
+            raw += panoramas.raw
+            resized += panoramas.resized
+            shapes += panoramas.remarks
         camera_of |= found
         remarks += about
     used = [name for name, camera in cameras.items() if any(camera is one for one in camera_of.values())]
@@ -266,14 +267,26 @@ def _of_folder(
     remarks += [about for name in used if (about := about_principal_point(name, cameras[name]))]
     unused = [] if given or used or panorama else beside.unused(sizes)
     remarks += unused
+    unusable = bool(unused)
+    remarks += [*_about_raw(raw), *shapes]
+    unused = [*unused, *shapes]
+    no_lens = {*raw, *resized}
+    sizes = {size: plain for size, names in sizes.items() if (plain := [name for name in names if name not in no_lens])}
+    if not sizes and not camera_of:
+        is_raw = f"its photographs are raw images of two lenses; {advice('two circles')}."
+        raise InputError(f"{folder}: {' '.join([*([is_raw] if raw else []), *shapes])}")
     rest = sorted(name for names in sizes.values() for name in names if name not in camera_of)
     lens: CalibratedLens | None = None
+    if rest and panorama and of_map is None and not camera_of and not given:
+        raise InputError(
+            f"{folder}: its photographs, {_told(sizes)}, are no full panoramas, which are twice as wide as high; "
+            f"{advice('no panoramas')}."
+        )
     if rest and not camera_of and not given:
         order = sorted(sizes, key=lambda size: -len(sizes[size]))
-        told = ", ".join(f"{len(sizes[size])} of {size[0]} x {size[1]} pixels" for size in order[:MAX_NAMED])
         files = "their calibration" if len(sizes) == 1 else "a file with the calibrations of all of them"
         put_it = advice("calibration").format(files=files)
-        unknown = f"{folder}: its photographs, {told}, are not full panoramas (2 to 1)"
+        unknown = f"{folder}: its photographs, {_told(sizes)}, are not full panoramas (2 to 1)"
         if of_map is not None:
             lenses = [camera for camera in of_map.values() if not isinstance(camera, Equirectangular)]
             nor = f" and of no camera of the map ({_sizes(lenses)} pixels)" if lenses else ""
@@ -283,7 +296,7 @@ def _of_folder(
         try:
             lens = find_lens([folder / name for name in sizes[order[0]]], order[0])
         except InputError as error:
-            none = "have no calibration that can be used" if unused else "have no calibration"
+            none = "have no calibration that can be used" if unusable else "have no calibration"
             raise InputError(" ".join((f"{unknown} and {none}, and {error}. Or {put_it}.", *unused))) from None
         camera_of = dict.fromkeys(sizes[order[0]], lens[0])
         rest = [name for name in rest if name not in camera_of]
@@ -294,6 +307,8 @@ def _of_folder(
         and_so = f", but the calibration is for {_sizes(given.values())}." if of_another_size else "."
         if of_map is not None:
             and_so = "; put its calibration into that folder."
+        if near_two_to_one((width, height)) and not given and width != 2 * height:
+            and_so = f"{and_so[:-1]}; full panoramas are twice as wide as high."
         remarks.append(
             f"{len(rest)} of {len(rest) + len(camera_of)} images were left out, as their camera is not known; the "
             f"first is {shorten(rest[0])} with {width} x {height} pixels{and_so}"
@@ -310,6 +325,12 @@ def _of_folder(
         camera = for_model[repr(camera_of[name])]
         views.append(View(place.name_of(name), camera, folder / name, timestamp_s=time_s))
     return views, remarks, lens
+
+
+def _told(sizes: Mapping[tuple[int, int], Sequence[str]]) -> str:
+    """How many images there are of each size, the most frequent first."""
+    order = sorted(sizes, key=lambda size: -len(sizes[size]))
+    return ", ".join(f"{len(sizes[size])} of {size[0]} x {size[1]} pixels" for size in order[:MAX_NAMED])
 
 
 def _sizes(cameras: Collection[Camera]) -> str:
@@ -470,23 +491,3 @@ def _were(count: int, what: str) -> str:
 
 def _some(names: Sequence[str]) -> str:
     return f"{', '.join(shorten(name) for name in names[:MAX_NAMED])}{', …' if len(names) > MAX_NAMED else ''}"
-
-
-def _is_raw(path: Path, height: int) -> bool:
-    """Whether an image of that height, px, shows two circles (``two_circles``)."""
-    return two_circles(read_eighth(path) if height >= MIN_REDUCED_PX else read_image(path))
-
-
-def two_circles(image: ByteArray) -> bool:
-    """Whether an image (H, W) or (H, W, 3) of 2 to 1 shows the raw circles of two fisheyes: both halves are black in
-    their corners and not in the rows between. A panorama has its zenith along the whole upper edge, and its nadir along
-    the lower one."""
-    height = image.shape[0]
-    side, middle = max(2, height // 20), height // 2
-    for half in np.split(grey(image)[:, : 4 * (height // 2)], 2, axis=1):
-        for edge in (half, half[::-1]):
-            corners = np.hstack([edge[:side, :side], edge[:side, -side:]])
-            between = edge[side // 2 : side, middle - side : middle + side]
-            if np.percentile(corners, 90) > BLACK or between.mean() <= 2 * BLACK:
-                return False
-    return True

@@ -41,6 +41,11 @@ NEAR_SD = 2.5
 """Positions within this many robust standard deviations are used in the fit."""
 _COLUMNS = "image x y z in metres"
 _GPS_WORDS = ({"lat", "latitude"}, {"lon", "lng", "long", "longitude"}, {"alt", "altitude"})
+_METRE_WORDS = (
+    {"x", "east", "easting"},
+    {"y", "north", "northing"},
+    {"z", "up", "alt", "altitude", "elevation", "height"},
+)
 _SPACED = re.compile(r"(.*?\S)\s+([-+.\deE]+)\s+([-+.\deE]+)\s+([-+.\deE]+)(?:\s+#.*)?")
 """A name, three numbers and perhaps a comment, with spaces between them."""
 _EQUATOR_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
@@ -81,7 +86,8 @@ class SimilarityFit:
 
 
 def read_positions(path: Path, views: Sequence[View]) -> Positions:
-    """Positions in a file: rows ``image x y z``, a table with columns image, lat, lon, or a trajectory (TUM, EuRoC).
+    """Positions in a file: rows ``image x y z``, a table with titles (image, lat, lon or image, easting, northing), or
+    a trajectory (TUM, EuRoC).
 
     A trajectory is interpolated at the times in the images' names. Raises ``InputError`` for a wrong row, and for a
     file that has no position of any image.
@@ -150,38 +156,46 @@ def _words(text: str) -> list[str]:
 def _of_rows(path: Path, views: Sequence[View]) -> Positions:
     names = {view.name for view in views}
     columns: list[int] | None = None
+    in_degrees, named = False, ""
     found: dict[str, FloatArray] = {}
     count = 0
     for number, (place, text) in enumerate(rows(path, f"rows of {_COLUMNS}")):
         words = _words(text)
-        if number == 0 and ((columns := _gps_columns(words)) is not None or _are_titles(words)):
-            continue
+        if number == 0:
+            columns = _columns(words, _GPS_WORDS)
+            in_degrees = columns is not None
+            columns = columns or _columns(words, _METRE_WORDS)
+            if columns is not None:
+                continue
         wanted = 4 if columns is None else max(columns) + 1
         if len(words) < wanted or (columns is None and len(words) != wanted):
             what = _COLUMNS if columns is None else "the columns of the first one"
             raise InputError(f"{place}: has {len(words)} words; give {what}.")
         numbers = finite_numbers(words[1:4] if columns is None else [words[column] for column in columns], place)
-        if columns is not None and not (abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 360.0):
+        if in_degrees and not (abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 360.0):
             exchanged = abs(numbers[1]) <= 90.0 and abs(numbers[0]) <= 360.0
             advice = "exchange the titles of the two columns" if exchanged else "give degrees"
             raise InputError(f"{place}: {numbers[0]:g}, {numbers[1]:g} is not a latitude and longitude; {advice}.")
         if words[0] in found:
             raise InputError(f"{place}: {show(words[0])} is there a second time; keep one row.")
         count += 1
+        named = named or words[0]
         if words[0] in names:
             found[words[0]] = np.array([*numbers, 0.0][:3])
     if not found:
+        first = f", such as {show(named)}," if named else ""
         raise InputError(
-            f"{path}: none of its {count} rows names one of the {len(views)} images, such as {show(views[0].name)}; "
-            "use the file names of the images."
+            f"{path}: none of its {count} rows{first} names one of the {len(views)} images, such as "
+            f"{show(views[0].name)}; use the file names of the images, with their folder and ending."
         )
-    if columns is None:
+    if not in_degrees:
         if _are_degrees(np.array(list(found.values()))):
             raise InputError(
                 f"{path}: its positions seem to be latitudes and longitudes in degrees, and metres are expected; name "
                 "the columns in the first row: image,lat,lon."
             )
-        return Positions(found, f"the positions in {shorten(path.name)}")
+        flat = columns is not None and len(columns) == 2
+        return Positions(found, f"the positions in {shorten(path.name)}", horizontal=flat)
     exchanged = {name: at[[1, 0, 2]] for name, at in found.items()}
     possible = all(abs(at[0]) <= 90.0 for at in exchanged.values())
     other = local_metres(exchanged) if possible else None
@@ -196,16 +210,10 @@ def _are_degrees(positions: FloatArray) -> bool:
     return len(flat) >= MIN_POSITIONS and 100.0 * spread < away and spread < MAX_SPREAD_DEG and bool(in_range.all())
 
 
-def _are_titles(words: Sequence[str]) -> bool:
-    """Whether a row has the titles of ``image x y z``."""
-    return [word.lower() for word in words[1:]] == ["x", "y", "z"]
-
-
-def _gps_columns(words: Sequence[str]) -> list[int] | None:
-    """Columns of latitude, longitude and, if there is one, altitude in a row of names; None for another row."""
-    places = [
-        next((at for at, word in enumerate(words) if word.strip('"').lower() in kind), None) for kind in _GPS_WORDS
-    ]
+def _columns(words: Sequence[str], kinds: Sequence[set[str]]) -> list[int] | None:
+    """Columns of two coordinates and, if there is one, the height in a row of titles; None for another row."""
+    titles = [word.strip('"').lower().removesuffix("_m") for word in words]
+    places = [next((at for at, word in enumerate(titles) if at and word in kind), None) for kind in kinds]
     if places[0] is None or places[1] is None:
         return None
     return [at for at in places if at is not None]

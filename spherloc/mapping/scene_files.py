@@ -30,7 +30,7 @@ SCENE = "scene.toml"
 MAP_FOLDER = "{}_map"
 """What the folder of a map is called, by that of its photographs."""
 GRAVITY = "gravity.txt"
-"""Gravity of the map's images by the IMU of a sequence that they are of."""
+"""Gravity of the map's images by the IMU of a sequence that they are of, or by their tags."""
 LENS = "lens.toml"
 """Calibration file of a lens that the map's images told."""
 COMMENT_WIDTH = 110
@@ -196,7 +196,7 @@ def write_new_scene(
 
 def write_gravity(path: Path, found: Mapping[str, Gravity]) -> None:
     """Write a gravity file, of vectors by the name of the image; raises ``OSError``."""
-    rows = ["# image gx gy gz sd_deg: down in the camera's frame, by the IMU"]
+    rows = ["# image gx gy gz sd_deg: down in the camera's frame"]
     for name, one in found.items():
         sd_deg = "" if one.bound_rad is None else f" {np.degrees(one.bound_rad) / BOUND_SD:.4g}"
         rows.append(f'"{name}" {" ".join(f"{value:.7f}" for value in one.down)}{sd_deg}')

@@ -8,7 +8,7 @@ import numpy as np
 
 from spherloc.datasets.imu import MIN_S, NAME_RULE, read_imu
 from spherloc.datasets.query_gravity import ImuLog, read_gravity_file
-from spherloc.errors import InputError, shorten
+from spherloc.errors import InputError, shorten, show
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.photographs import cameras_of
 from spherloc.types import FloatArray
@@ -29,7 +29,16 @@ class StatedGravity:
     """Sentences on what does not fit together."""
     in_map_folder: bool = False
     """Whether a gravity file of them is written for the scenes of the map, as ``file`` is the log of an IMU that
-    several cameras are fixed to."""
+    several cameras are fixed to, or since it is from tags."""
+    lines_agree: bool = False
+    """Whether vertical lines agree with it, so that those of queries are searched where nothing is stated."""
+    doubts: tuple[str, ...] = ()
+    """Sentences on how it contradicts the photographs (``gravity_check``)."""
+
+    @property
+    def is_gravity_file(self) -> bool:
+        """Whether ``file`` is a gravity file and no log of an IMU."""
+        return self.camera_from_imu is None and not self.in_map_folder
 
 
 def read_stated_gravity(file: Path, camera_from_imu: FloatArray | None, views: Sequence[View]) -> StatedGravity:
@@ -43,11 +52,12 @@ def read_stated_gravity(file: Path, camera_from_imu: FloatArray | None, views: S
         rows, names = read_gravity_file(file), {view.name for view in views}
         found = {name: one for name, one in rows.items() if name in names}
         strange = [name for name in rows if name not in names]
-        rule = "name them as the folder does: image gx gy gz [sd_deg]"
-        if strange:
+        as_there = f"their names, such as {show(views[0].name)}" if views else "their names"
+        rule = f"it names {show(next(iter(rows), ''))}; give rows image gx gy gz [sd_deg] with {as_there}"
+        if strange and found:
             remarks.append(
                 f"{file}: {len(strange)} of its {len(rows)} rows belong to none of the photographs, the first is "
-                f"{shorten(strange[0])}."
+                f"{shorten(strange[0])}; their names are such as {shorten(views[0].name)}."
             )
     elif (count := len(cameras_of(views))) > 1:
         raise InputError(

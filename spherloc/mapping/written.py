@@ -136,7 +136,7 @@ def _name(images: Path, scale: MapScale) -> str:
 def _gravity(level: Level, stated: StatedGravity | None, folder: Path) -> list[str]:
     bound = max(MIN_BOUND_DEG, round(2.0 * level.spread_deg, 1))
     lines = ["", "[gravity]", "map = [0.0, 0.0, -1.0]", f"bound_deg = {bound}"]
-    if level.by_lines:
+    if level.by_lines or (stated is not None and stated.lines_agree):
         lines.append('query = "lines"                # where an image shows too few, gravity is that of its reference')
     if stated is not None and not stated.in_map_folder:
         file = toml_text(relative(stated.file, folder))

@@ -279,10 +279,10 @@ def map(
     Args:
         folder: Folder of the photographs, of a folder for each camera, or a sequence in the layout of EuRoC or TUM-VI
             (mav0), whose IMU and ground truth are used; with --video, where its frames are put.
-        camera: Calibration file; without it, those beside the images are taken, others of 2 to 1 are panoramas, and
+        camera: Calibration file; without it, those beside the images are taken, full panoramas need none, and
             matches between the rest tell their lens.
         camera_name: Which camera of that file all images have; otherwise their name or their folder's says it.
-        panorama: Images of 2 to 1 are panoramas, whatever lies beside them.
+        panorama: Images of about 2 to 1 are panoramas of the whole sphere, whatever they show or lies beside them.
         video: Take frames from this video first, the sharpest of each stretch.
         frames: How many images of each camera to map, the sharpest of each stretch of the video or of the folder; 40
             if not given, of a folder only if it has more than 500 images or a recorded sequence of more than 100.

@@ -13,7 +13,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from spherloc.frontend.view import View
 from spherloc.images import check_image, read_size
 from spherloc.mapping.advice import advice, for_a_page
 from spherloc.mapping.frames import FRAMES, FrameChoice, frames_of
+from spherloc.mapping.gravity_check import check_stated
 from spherloc.mapping.kept_scale import FILE as SCALE_FILE
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
 from spherloc.mapping.make import Map, MapRequest, ScaleMeasurement, make_map
@@ -58,6 +59,7 @@ from spherloc.mapping.scene_files import (
 )
 from spherloc.mapping.sequence import sequence_data
 from spherloc.mapping.stated_gravity import read_stated_gravity
+from spherloc.mapping.tag_gravity import stated_by_tags
 from spherloc.mapping.true_poses import truth_words
 from spherloc.registry import require
 from spherloc.types import FloatArray
@@ -117,11 +119,17 @@ def make(
         unscaled = measured == ScaleMeasurement()
         data = sequence_data(folder, found.views, gravity=gravity is None, positions=unscaled)
         stated = stated or data.stated
-        for remark in (*found.remarks, *(() if stated is None else stated.remarks), *data.remarks):
+        about_gravity: Sequence[str] = ()
+        if stated is None:
+            stated, about_gravity = stated_by_tags(found.views, tell)
+        else:
+            stated = replace(stated, doubts=tuple(check_stated(stated, found.views, tell)))
+            about_gravity = stated.doubts
+        for remark in (*found.remarks, *(() if stated is None else stated.remarks), *data.remarks, *about_gravity):
             say(remark)
         others = None
         if new_images is not None:
-            others, remarks = new_images_of(new_images, found, panorama, choice, imu=gravity is None)
+            others, remarks = new_images_of(new_images, found, panorama, choice, measured_gravity=gravity is None)
             for remark in remarks:
                 say(f"{new_images}: {remark}")
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")

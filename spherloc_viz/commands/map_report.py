@@ -57,6 +57,7 @@ def summary(made: Map, found: Photographs) -> list[str]:
             f"in doubt      whether down is right: {100 * above:.0f} % of the points are above the cameras; the stated "
             "gravity must point down, with x right, y down and z forward"
         )
+    lines += [f"in doubt      {doubt}" for doubt in made.doubts]
     if made.carried_deg:
         lines.append(f"masked        {_carried_words(made.carried_deg)}")
     if missing:
@@ -209,6 +210,7 @@ def map_report(made: Map, found: Photographs) -> str:
 def _doubts(made: Map) -> list[str]:
     against, far = made.made.contradictions, made.scale.misplaced
     said = [f'<p class="out">Images {html.escape(_far_words(far))}.</p>'] if far else []
+    said += [f'<p class="out">In doubt: {html.escape(doubt)}</p>' for doubt in made.doubts]
     if made.opposed:
         said.append(f'<p class="out">In doubt: {html.escape(_opposed_words(*made.opposed))}.</p>')
     if made.made.unsure:

@@ -48,9 +48,16 @@ def test_rows_of_a_gravity_file(tmp_path):
     assert found["sub/c.png"].bound_rad == 0.0
 
 
+@pytest.mark.parametrize("titles", ["image,gx,gy,gz,sd_deg", "name x y z", '"image","gx","gy","gz","sd"'])
+def test_the_first_row_of_a_gravity_file_may_have_titles(tmp_path, titles):
+    assert list(read_gravity_file(written(tmp_path, f"{titles}\na.jpg,0,1,0,0.5\n"))) == ["a.jpg"]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
+        ("image,gy,gx,gz\na.jpg,0,1,0\n", "line 1: 'gy' is not a finite number"),
+        ("a.jpg,0,1,0\nimage,gx,gy,gz\n", "line 2: 'gx' is not a finite number"),
         ("a.jpg 0 1\n", "line 1: is not a row image gx gy gz"),
         ("# c\na.jpg 0 1 0 1 1\n", "line 2: is not a row image gx gy gz"),
         ("a.jpg 0 one 0\n", "line 1: 'one' is not a finite number"),

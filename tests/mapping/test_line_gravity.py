@@ -1,16 +1,21 @@
 """Gravity of photographs by their lines where they are stored sideways, as those of headsets are."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.datasets import bundled_scenes, load_scene
+from spherloc.errors import InputError
 from spherloc.frontend.view import Gravity, View
-from spherloc.geometry import camera_centre
+from spherloc.geometry import camera_centre, so3_exp
+from spherloc.mapping.gravity_check import check_stated
 from spherloc.mapping.line_gravity import gravity_by_lines, share_below
+from spherloc.mapping.stated_gravity import StatedGravity
 
 COUNT = 7
 
@@ -109,3 +114,39 @@ def test_gravity_that_a_file_states_shows_where_to_look_in_the_others(upright, t
     lines = gravity_by_lines(views, quiet, stated)
     assert views[0].name not in lines.found and lines.other is None and len(lines.found) >= 4
     assert max(off_deg(view, lines.found[view.name]) for view in views[1:] if view.name in lines.found) < 1.0
+
+
+def stated_of(views: list[View], turn: np.ndarray, **changes) -> StatedGravity:
+    """True gravity of the views, turned in the camera frame."""
+    downs = {view.name: turn @ view.cam_from_map[:, :3] @ [0.0, 0.0, -1.0] for view in views}
+    found = {name: Gravity(down, "the gravity file", np.radians(1.5)) for name, down in downs.items()}
+    return replace(StatedGravity(found, Path("gravity.txt"), None, ()), **changes)
+
+
+@pytest.mark.parametrize("quarters", [0, 1])
+def test_stated_gravity_that_is_right_contradicts_no_lines(upright, tmp_path, quarters):
+    views = turned(upright, tmp_path, quarters)
+    assert check_stated(stated_of(views, np.eye(3)), views, quiet) == []
+
+
+def test_stated_gravity_that_contradicts_the_lines_is_told(upright):
+    off = so3_exp(np.radians([0.0, 0.0, 7.0]))
+    (said,) = check_stated(stated_of(upright, off), upright, quiet)
+    assert "differs from the vertical lines of 7 of 7 images by 7.1° (median), more than both bounds allow" in said
+    assert check_stated(stated_of(upright[:1], off), upright, quiet) == []  # one image may be wrong
+    (said,) = check_stated(stated_of(upright, -np.eye(3)), upright, quiet)
+    assert "points to the upper edge of 7 of 7 images: if the camera was not upside down, it is up" in said
+
+
+def test_stated_gravity_that_contradicts_the_down_of_panoramas(tmp_path, rng):
+    """Their camera made them upright. That of an accelerometer is refused, since the map would be upside down."""
+    assert cv2.imwrite(str(tmp_path / "a.png"), rng.integers(0, 255, (100, 200), np.uint8))
+    pose = np.column_stack([[[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], np.zeros(3)])
+    views = [View(f"{k}.png", Equirectangular(200, 100), tmp_path / "a.png", pose) for k in range(3)]
+    assert check_stated(stated_of(views, np.eye(3)), views, quiet) == []
+    with pytest.raises(InputError, match=r"seems to point up in 3 of 3 panoramas, as an accelerometer measures; give"):
+        check_stated(stated_of(views, -np.eye(3)), views, quiet)
+    (said,) = check_stated(stated_of(views, -np.eye(3), in_map_folder=True), views, quiet)
+    assert said.endswith("check how the IMU is turned to the camera.")
+    (said,) = check_stated(stated_of(views, so3_exp(np.radians([90.0, 0.0, 0.0]))), views, quiet)
+    assert "differs from the panoramas' own down by 90° (median) and seems wrong" in said

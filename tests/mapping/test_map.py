@@ -32,6 +32,7 @@ from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.advice import COMMAND, PAGE, for_a_page
 from spherloc.mapping.frames import frames_of
+from spherloc.mapping.full_panorama import two_circles
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.line_gravity import gravity_by_lines
@@ -39,7 +40,7 @@ from spherloc.mapping.make import MapRequest, ScaleMeasurement, make_map, scale_
 from spherloc.mapping.misplaced import far_off, without_misplaced
 from spherloc.mapping.new_images import NewImages, new_images_of
 from spherloc.mapping.new_queries import add_new_images, map_images
-from spherloc.mapping.photographs import Photographs, _is_in, photographs, two_circles
+from spherloc.mapping.photographs import Photographs, _is_in, photographs
 from spherloc.mapping.scene_files import (
     MODEL,
     SCENE,
@@ -181,6 +182,9 @@ def test_gravity_that_a_file_states_goes_before_that_of_lines(walk, tmp_path):
     assert "in doubt" not in "".join(summary(made, found))
     up = replace(made, written=replace(made.written, points=made.written.points * [1.0, 1.0, -1.0] + [0.0, 0.0, 9.0]))
     assert "of the points are above the cameras; the stated gravity must point down" in "".join(summary(up, found))
+    doubted = replace(made, doubts=("gravity.txt: its gravity points <up>.",))
+    assert "in doubt      gravity.txt: its gravity points <up>." in summary(doubted, found)
+    assert '<p class="out">In doubt: gravity.txt: its gravity points &lt;up&gt;.</p>' in map_report(doubted, found)
     page = map_report(made, found)
     assert "<td>the gravity file, at most 1.5° off</td>" in page and "<td>lines of the image, at most " in page
     for name in names:
@@ -193,7 +197,7 @@ def test_gravity_that_a_file_states_goes_before_that_of_lines(walk, tmp_path):
     assert alone.source == "the gravity file of 1 image" and not alone.by_lines
 
     (tmp_path / "none.txt").write_text("else.png 0 1 0")
-    with pytest.raises(InputError, match=r"none.txt: has gravity of none of the 5 photographs; name them as"):
+    with pytest.raises(InputError, match=r"none of the 5 photographs; it names 'else.png'; .* such as 'reference_0"):
         read_stated_gravity(tmp_path / "none.txt", None, found.views)
 
 

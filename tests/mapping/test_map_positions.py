@@ -151,6 +151,7 @@ def test_rows_of_positions_and_of_gps(tmp_path):
         "image;x;y;z\nFoto 00 #1 ä.JPG;1;2.5;-3",
         "image,x,y,z\nFoto 00 #1 ä.JPG,1,2.5,-3",
         "Foto 00 #1 ä.JPG\t1\t2.5\t-3",
+        "image,time,Northing,Easting,height_m\nFoto 00 #1 ä.JPG,9,2.5,1,-3",
     ],
 )
 def test_names_may_have_spaces_and_columns_titles(tmp_path, row):
@@ -158,6 +159,15 @@ def test_names_may_have_spaces_and_columns_titles(tmp_path, row):
     path.write_text(f"{row}\n", encoding="utf-8")
     found = read_positions(path, [View(name, VIEWS[0].camera, Path(name))]).by_name
     np.testing.assert_array_equal(found[name], [1.0, 2.5, -3.0])
+
+
+def test_positions_without_heights_are_horizontal(tmp_path):
+    path = tmp_path / "positions.csv"
+    path.write_text(
+        "".join(["image,easting,northing\n", *(f"{name},691000.5,5335{k}\n" for k, name in enumerate(NAMES))])
+    )
+    found = read_positions(path, VIEWS)
+    assert found.horizontal and found.by_name[NAMES[1]].tolist() == [691000.5, 53351.0, 0.0]
 
 
 @pytest.mark.parametrize(
@@ -168,7 +178,7 @@ def test_names_may_have_spaces_and_columns_titles(tmp_path, row):
         (f"{NAMES[0]} 1 2 x\n", "line 1: 'x' is not a finite number"),
         (f"{NAMES[0]},1,2,3\r{NAMES[1]},1,2,3\r", "line 1: has . words; give image x y z"),
         (f"{NAMES[0]} 1 2 3\n{NAMES[0]} 1 2 3\n", "line 2: .* a second time"),
-        ("a.jpg 1 2 3\n", "none of its 1 rows names one of the 8 images"),
+        ("in/a.jpg 1 2 3\n", "none of its 1 rows, such as 'in/a.jpg', names one of the 8 images, such as 'frame_"),
         (f"image lat lon\n{NAMES[0]} 97 98\n", "is not a latitude and longitude; give degrees"),
         (f"image lat lon\n{NAMES[0]} -122.3 37\n", "is not a latitude and longitude; exchange the titles"),
         (

@@ -188,7 +188,7 @@ def test_the_sharpest_of_each_stretch_is_mapped_and_others_are_localized(tmp_pat
     assert len(new.views) == 24 and not {view.path for view in new.views} & {view.path for view in found.views}
     assert "24 of 180 images are localized" in remarks[1] and "not in the map" in remarks[1]
     assert sorted(new.gravity) == sorted(view.name for view in new.views)
-    assert not new_images_of(tree.mav, found, choice=FrameChoice(12), imu=False)[0].gravity
+    assert not new_images_of(tree.mav, found, choice=FrameChoice(12), measured_gravity=False)[0].gravity
     sections = ("", "[gravity]", "map = [0.0, 0.0, -1.0]", 'file = "mine.txt"')
     head = MapHead("m", "a", "..", 'units = "metres"', sections)
     scene = write_new_scene(head, tmp_path, new, found.views[0].camera)
