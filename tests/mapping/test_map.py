@@ -2,6 +2,7 @@
 
 import copy
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -32,6 +33,7 @@ from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.advice import COMMAND, PAGE, for_a_page
 from spherloc.mapping.frames import frames_of
+from spherloc.mapping.kept_models import FILE as KEPT_MODELS
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.line_gravity import gravity_by_lines
@@ -301,7 +303,42 @@ def test_what_is_done_is_not_done_again(walk):
     assert repeated.written.poses.keys() == made.written.poses.keys()
     assert len(repeated.written.points) == len(made.written.points)
     for name, pose in made.written.poses.items():
-        np.testing.assert_allclose(repeated.written.poses[name], pose, atol=1e-9)
+        np.testing.assert_array_equal(repeated.written.poses[name], pose)
+    np.testing.assert_array_equal(repeated.written.points, made.written.points)
+
+
+def test_models_are_kept_for_the_same_photographs_only(walk, tmp_path, monkeypatch):
+    """Another scale takes them, too; a photograph that changed, another gravity, or a damaged file does not."""
+    _, found, made, _, _, output = walk
+    folder, images = tmp_path / "map", tmp_path / "photographs"
+    shutil.copytree(output, folder)
+    shutil.copytree(found.views[0].path.parent, images)  # with the times of the files
+    views = [replace(view, path=images / view.path.name) for view in found.views]
+    content = (folder / KEPT_MODELS).read_bytes()
+
+    def asked(changed, stated=None):
+        (folder / KEPT_MODELS).write_bytes(content)
+        return make_map(MapRequest(changed, images, masks=Masks(nadir_deg=12.0), stated=stated), folder)
+
+    def refuse(*_):
+        raise InputError("made again")
+
+    monkeypatch.setattr("spherloc.mapping.make.reconstruct", refuse)
+    unscaled = asked(views)
+    assert not unscaled.scale.source
+    share = np.linalg.norm(unscaled.written.points, axis=1) / np.linalg.norm(made.written.points, axis=1)
+    np.testing.assert_allclose(share, share[0])
+    gravity = tmp_path / "gravity.txt"
+    gravity.write_text("".join(f"{view.name} 0 1 0\n" for view in views))
+    for change in ("gravity", "photograph", "damage"):
+        if change == "photograph":
+            os.utime(views[0].path, (1.0, 1.0))
+        if change == "damage":
+            shutil.copystat(found.views[0].path, views[0].path)
+            content = content[:2000] + bytes(100) + content[2100:]
+        with pytest.raises(InputError, match="made again"):
+            asked(views, read_stated_gravity(gravity, None, views) if change == "gravity" else None)
+        assert not (folder / KEPT_MODELS).exists()
 
 
 def test_the_report_says_what_is_in_the_map(walk):
