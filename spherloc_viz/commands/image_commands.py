@@ -24,6 +24,7 @@ from spherloc_viz.commands.flags import (
     OptionalText,
     Settings,
 )
+from spherloc_viz.given_files import known_as
 from spherloc_viz.importing import importing
 
 
@@ -195,6 +196,11 @@ def diagnose(
         raise InputError(f"{poses}: no such file; give a file of poses, or the folder of a COLMAP model.")
     from spherloc.formats.hloc_log import is_log
 
+    takes = is_log(poses) or poses.suffix.lower() == ".csv"
+    if is_folder(poses):
+        takes = is_file(poses / "images.bin") or is_file(poses / "images.txt")
+    if not takes and (told := known_as(poses)):
+        raise InputError(told)
     own = matches is None and database is None and not scenes
     logged = own and is_log(poses)
     if (model is not None) != (database is not None) and not (logged and database is None):

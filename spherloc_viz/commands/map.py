@@ -63,6 +63,7 @@ from spherloc.registry import require
 from spherloc.types import FloatArray
 from spherloc_viz.commands.map_report import MAP_FEATURES, map_report, summary
 from spherloc_viz.commands.progress import progress, say
+from spherloc_viz.given_files import known_as
 
 REPORT = "report.html"
 ESTIMATOR = "auto"
@@ -99,6 +100,8 @@ def make(
     """
     end_without_a_trace()
     how = how_of(features)
+    if not is_folder(folder) and (told := known_as(folder)):
+        raise InputError(told)
     target = output or Path(MAP_FOLDER.format(folder.resolve().name))
     check_images_of(target, folder)
     with _stages() as tell, _compiled_for(new_images):
