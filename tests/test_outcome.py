@@ -15,6 +15,7 @@ from spherloc.geometry import yaw_rotation
 from spherloc.metrics import evaluate
 from spherloc.outcome import Outcome, judge
 from spherloc.problem import Problem
+from spherloc_viz.app.text import ToldBeside, summary_html
 
 
 def solved(problem, estimator="ransac-2p", **options):
@@ -61,6 +62,8 @@ def test_two_poses_that_stand_out_are_not_called_localized(scene_of, moved, outc
     assert lead(200 - moved, moved) > MIN_LEAD
     assert judge(trace).outcome == outcome
     assert (diagnose(trace).cause is Cause.OK) == (outcome == "localized")
+    told = summary_html(trace, ToldBeside("gravity prior off"))
+    assert ("Localized, but in doubt: gravity prior off" in told) == (outcome == "localized")
 
 
 def test_degenerate_poses_are_doubtful():

@@ -175,7 +175,8 @@ def diagnose(
             (kind "correspondences"), named by the problem, its image or the file. None with --matches.
         matches: The matches of all queries instead of scenes: a CSV with the columns name, u, v (px), X, Y, Z, and
             inlier (0 or 1) where that is known.
-        camera: The calibration file of these queries.
+        camera: The calibration file of these queries; with hloc's log, of those that have no camera in it and are no
+            images of the model.
         model: The COLMAP model of the map, for a log of hloc without scenes, or with --database.
         database: COLMAP's database instead of scenes: the verified matches of all images that --model lacks. With
             --gravity those that COLMAP could not register are solved by auto and diagnosed too.
@@ -209,10 +210,10 @@ def diagnose(
         raise InputError("the matches come from scenes, from --matches or from --database; give one of them.")
     if own and not logged:
         raise InputError("no scene given; name the scene files whose queries the poses are of, or give --matches.")
-    if (matches is None) != (camera is None) or (gravity is not None and scenes):
-        raise InputError(
-            "--matches needs --camera and goes with it only; --gravity does not go with scenes, which say that."
-        )
+    if (matches is not None and camera is None) or (scenes and (camera is not None or gravity is not None)):
+        raise InputError("--matches needs --camera; neither --camera nor --gravity goes with scenes, which say that.")
+    if camera is not None and database is not None:
+        raise InputError("--database has the cameras itself; leave out --camera.")
     files = [scene_path(scene) for scene in scenes]
     for file in files:
         check_there(file)
@@ -235,7 +236,7 @@ def diagnose(
     elif matches is not None and camera is not None:
         table = read_match_table(matches, camera, gravity, map_down)
     else:
-        table, wrong = read_logged_matches(poses, model, gravity, map_down)
+        table, wrong = read_logged_matches(poses, model, camera, gravity, map_down)
     for error in wrong:
         say(f"{error} It is left out.")
     return diagnose_poses(poses, [table], bound_px, label, json, kept)
