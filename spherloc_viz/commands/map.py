@@ -11,7 +11,7 @@ import shlex
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +62,7 @@ from spherloc.mapping.true_poses import truth_words
 from spherloc.registry import require
 from spherloc.types import FloatArray
 from spherloc_viz.commands.map_report import MAP_FEATURES, map_report, summary
-from spherloc_viz.commands.progress import progress, say
+from spherloc_viz.commands.progress import Advance, progress, say
 from spherloc_viz.given_files import known_as
 
 REPORT = "report.html"
@@ -302,7 +302,7 @@ def _compiled_for(new_images: Path | None) -> AbstractContextManager[None]:
 def _stages() -> Iterator[Tell]:
     """Progress of one kind of work after another."""
     with ExitStack() as stack:
-        running: dict[str, Callable[[str], None]] = {}
+        running: dict[str, Advance] = {}
         done = 0
 
         def tell(kind: str, number: int, count: int) -> None:
@@ -313,7 +313,7 @@ def _stages() -> Iterator[Tell]:
                 running[kind] = stack.enter_context(progress(count, kind))
                 done = 0
             while done < number:
-                running[kind]("")
+                running[kind]("", count)
                 done += 1
 
         yield tell

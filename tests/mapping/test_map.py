@@ -62,6 +62,7 @@ from spherloc_viz.commands.map import (
     _kind,
     _of_the_map_before,
     _sizes,
+    _stages,
     _take_frames,
     cameras_of_file,
     distance_of,
@@ -780,6 +781,33 @@ def test_frames_of_a_video_are_its_sharpest(tmp_path, rng, capsys):
     with pytest.raises(InputError, match="cannot read it as a video"):
         frames_of(tmp_path / "text.mp4", tmp_path / "frames", 3, names.append)
     assert not (tmp_path / "frames").exists()
+
+
+def test_a_video_without_an_end_is_one_sentence(tmp_path):
+    """FFmpeg prints no line of its own before it; in a process of its own, as OpenCV sets that once."""
+    (tmp_path / "cut.mp4").write_bytes(b"\0\0\0\x14ftypisom\0\0\2\0isom" + b"\0\0\0\x10mdat" + bytes(8))
+    script = (
+        "import os\nfrom pathlib import Path\nfrom spherloc.errors import InputError\n"
+        "from spherloc.mapping.frames import frames_of\nbefore = dict(os.environ)\n"
+        "try:\n    frames_of(Path('cut.mp4'), Path('frames'), 3, print)\n"
+        "except InputError as error:\n    print(error, os.environ == before)"
+    )
+    environment = {key: value for key, value in os.environ.items() if key != "OPENCV_FFMPEG_LOGLEVEL"}
+    environment["PYTHONPATH"] = str(Path(__file__).parents[2])
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=LIMIT_S)
+    assert done.stdout.startswith("cut.mp4: OpenCV cannot read it as a video") and done.stdout.endswith("True\n")
+    assert done.stderr == ""
+
+
+def test_progress_follows_a_number_of_pieces_that_grows(monkeypatch, capsys):
+    """As that of joins of maps, whose number is not known before."""
+    monkeypatch.setattr("spherloc_viz.commands.progress.LINE_EVERY_S", -1.0)
+    with _stages() as tell:
+        for number in range(1, 4):
+            tell("joins of maps tried", number, number)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [f"spherloc: {number} of {number} joins of maps tried." for number in range(1, 4)]
 
 
 def test_a_lens_that_colmap_lacks_is_fitted():
