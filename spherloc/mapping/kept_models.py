@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from spherloc.disk_cache import DAMAGED_NPZ, key_of, store
-from spherloc.files import open_file, read_file
+from spherloc.files import is_file, names_in, open_file, read_file
 from spherloc.frontend.features import VERSION
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
@@ -88,8 +88,8 @@ def _write(folder: Path, key: str, made: Sequence[Reconstruction]) -> bool:
                 np.savez(model / _COUNTS, matches=one.matches, all_matches=one.all_matches)
                 told = {"images": list(one.poses), "contradictions": one.contradictions}
                 index["models"].append({**told, "joined": one.joined, "joints": one.joints})
-                for path in sorted(model.iterdir()):
-                    file.write(path, f"{number}/{path.name}")
+                for name in names_in(model):
+                    file.write(model / name, f"{number}/{name}")
             file.writestr(_INDEX, json.dumps(index))
     except (OSError, RuntimeError):
         return False
@@ -103,7 +103,7 @@ def _read(folder: Path, key: str) -> tuple[Reconstruction, ...] | None:
         with open_file(folder / FILE) as opened, zipfile.ZipFile(opened) as file, TemporaryDirectory() as place:
             index = json.loads(file.read(_INDEX))
             database = folder / Path(index["database"]).name
-            if index["key"] != key or not database.is_file():
+            if index["key"] != key or not is_file(database):
                 return None
             file.extractall(place)  # zipfile keeps every name inside
             return tuple(

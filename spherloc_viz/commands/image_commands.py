@@ -314,10 +314,11 @@ def map(
     """
     import numpy as np
 
+    from spherloc.cameras.calibration import camera_names
     from spherloc.datasets.query_gravity import camera_from_imu as rotation_of
     from spherloc.frontend.masks import Masks
     from spherloc.mapping.make import ScaleMeasurement
-    from spherloc_viz.commands.map import MAX_METRES, cameras_of_file, distance_of, make
+    from spherloc_viz.commands.map import MAX_METRES, distance_of, make
 
     if sum(one is not None for one in (camera_height, distance or None, positions)) > 1:
         raise InputError("--camera-height, --distance and --positions all give the scale; keep one.")
@@ -335,11 +336,14 @@ def map(
     masked = any(one is not None for one in (mask, nadir, seam))
     masks = Masks(mask, nadir or 0.0, seam or 0.0) if masked else None
     measured = ScaleMeasurement(camera_height, apart)
-    cameras = cameras_of_file(camera, camera_name)
+    if camera is None and camera_name is not None:
+        raise InputError(f"--camera-name {shlex.quote(camera_name)} goes with --camera FILE; give that file too.")
+    if camera is not None:
+        camera_names(camera)  # before frames are taken from a video
     made = make(
         folder,
         output,
-        cameras,
+        None if camera is None else (camera, camera_name),
         video,
         measured,
         localize,

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from spherloc.cameras.base import Camera
-from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.asl_layout import camera_of_folder
 from spherloc.datasets.scene_file import read_table
@@ -33,6 +32,7 @@ from spherloc.frontend.view import View
 from spherloc.images import check_image, read_size
 from spherloc.mapping.advice import advice, for_a_page
 from spherloc.mapping.frames import FRAMES, FrameChoice, frames_of
+from spherloc.mapping.given_cameras import given_cameras
 from spherloc.mapping.kept_scale import FILE as SCALE_FILE
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
 from spherloc.mapping.make import Map, MapRequest, ScaleMeasurement, make_map
@@ -77,7 +77,7 @@ MAX_SIZES = 4
 def make(
     folder: Path,
     output: Path | None,
-    cameras: Mapping[str, Camera],
+    camera: tuple[Path, str | None] | None,
     video: Path | None,
     measured: ScaleMeasurement,
     new_images: Path | None,
@@ -92,11 +92,12 @@ def make(
 ) -> "Finished":
     """Make the map, and print the result; raises ``InputError``.
 
-    ``cameras`` are those of the calibration file by name; ``frames`` says how many images of ``folder`` are mapped, or
-    taken from the ``video`` into it. With ``panorama``, images of 2 to 1 are panoramas in any case. With
-    ``find_carried``, what moves with the camera below panoramas is left out, too. ``positions`` is a file of where the
-    images were taken, ``gravity`` one of their gravity, with the rotation (3, 3) from the IMU to the camera if it is
-    the log of an IMU, and ``features`` one of ``MAP_FEATURES``, the best installed if None.
+    ``camera`` is a calibration file, with the name of one of its cameras if all images have that. ``frames`` says how
+    many images of ``folder`` are mapped, or taken from the ``video`` into it. With ``panorama``, images of 2 to 1 are
+    panoramas in any case. With ``find_carried``, what moves with the camera below panoramas is left out, too.
+    ``positions`` is a file of where the images were taken, ``gravity`` one of their gravity, with the rotation (3, 3)
+    from the IMU to the camera if it is the log of an IMU, and ``features`` one of ``MAP_FEATURES``, the best installed
+    if None.
     """
     end_without_a_trace()
     how = how_of(features)
@@ -107,6 +108,9 @@ def make(
     with _stages() as tell, _compiled_for(new_images):
         if video is not None:
             _take_frames(video, frames or FRAMES, folder, tell)
+        cameras, about_cameras = ({}, []) if camera is None else given_cameras(*camera, folder)
+        for remark in about_cameras:
+            say(remark)
         choice = FrameChoice(None if video is not None else frames, tell=tell)
         finder = _lens_finder(tell, folder, target, new_images)
         found = photographs(folder, cameras, masks, panorama, finder, choice)
@@ -250,18 +254,6 @@ def end_without_a_trace() -> None:
     """Let a termination signal simply end the process: once imported, pycolmap prints a stack trace at one."""
     require("pycolmap", "colmap", "making a map")
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
-def cameras_of_file(file: Path | None, name: str | None) -> dict[str, Camera]:
-    """The cameras of a calibration file by name, or the named one alone; none without a file."""
-    if file is None:
-        if name is not None:
-            raise InputError(f"--camera-name {shlex.quote(name)} goes with --camera FILE; give that file too.")
-        return {}
-    names = camera_names(file)
-    if name is not None or not names:
-        return {name or "": load_camera(file, name)}
-    return {one: load_camera(file, one) for one in names}
 
 
 def how_of(features: str | None = None) -> FrontendOptions:

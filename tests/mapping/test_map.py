@@ -33,6 +33,7 @@ from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.advice import COMMAND, PAGE, for_a_page
 from spherloc.mapping.frames import frames_of
+from spherloc.mapping.given_cameras import given_cameras
 from spherloc.mapping.kept_models import FILE as KEPT_MODELS
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
@@ -64,7 +65,6 @@ from spherloc_viz.commands.map import (
     _sizes,
     _stages,
     _take_frames,
-    cameras_of_file,
     distance_of,
     how_of,
     main,
@@ -505,7 +505,7 @@ def test_folders_have_the_cameras_of_their_numbers(tmp_path, rng):
         "cam07: The calibration found beside them: 007.",
         "cam10: The calibration found beside them: 010.",
     )
-    given = cameras_of_file(tmp_path / "sensors.txt", None)
+    given, _ = given_cameras(tmp_path / "sensors.txt", None, tmp_path)
     assert [view.camera.fx for view in photographs(tmp_path, given).views] == [90.0, 95.0]
     (tmp_path / "cam07").rename(tmp_path / "cam09")
     found = photographs(tmp_path, {})
