@@ -19,7 +19,7 @@ from spherloc.consensus.chance import chance_rate, expected_text
 from spherloc.consensus.inliers import mark_each
 from spherloc.consensus.spread import spread_in
 from spherloc.consensus.two_point_search import search_two_point
-from spherloc.diagnosis.evidence import MIN_SDS, agreeing, different, sd_of
+from spherloc.diagnosis.evidence import MIN_SDS, STRONG, agreeing, different, sd_of
 from spherloc.diagnosis.rival import rival_of
 from spherloc.free_gravity import MAX_NFA, MIN_LEAD, count_distinct, expected_by_chance, lead, nearby_support
 from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD
@@ -123,7 +123,8 @@ def _chance_margin(count: int, size: int, rate: float, fixed_by: int) -> tuple[f
 def _alternative_margin(
     trace: Trace, aligned: AlignedProblem, state: FloatArray, errors: FloatArray, size: int, rate: float, fixed_by: int
 ) -> tuple[float, str]:
-    """Margin over the best clearly different pose that chance does not explain."""
+    """Margin over the best clearly different pose that chance does not explain: it must be clearly smaller, and less
+    than the share ``STRONG``, with which a diagnosis says that either pose may be false."""
     bound_px, most = float(trace.options.bound_px), 0
     poses = (
         [] if (stage := trace.stage(ConsensusStage)) is None else [aligned.align_pose(p) for p in stage.cam_from_map]
@@ -144,7 +145,8 @@ def _alternative_margin(
             most = max(most, count_distinct(part, mask))
     if expected_by_chance(len(aligned.points), most, rate, fixed_by) > MAX_NFA:
         return np.inf, ""
-    return lead(size, most) - MIN_LEAD, f"Another pose explains {most} different matches, this one {size}."
+    needed = max(MIN_LEAD, lead(size, int(np.ceil(STRONG * size)) - 1))  # of many, it must lead by more
+    return lead(size, most) - needed, f"Another pose explains {most} different matches, this one {size}."
 
 
 def _gravity_margin(

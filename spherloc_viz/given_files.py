@@ -8,9 +8,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from spherloc.errors import InputError, RecordingError, SpherlocError
-from spherloc.files import is_file, is_folder
+from spherloc.files import is_file, is_folder, names_in
 
 RECORDING = ".rrd"
+RECORDINGS_FOLDER = "recordings"
+"""Name of the folder of the recordings beside results."""
 REVIEW_SUFFIX = ".review.rrd"
 """Ends the name of a review file, which otherwise is that of its run."""
 
@@ -26,19 +28,44 @@ def without_reviews(files: Sequence[Path]) -> tuple[Path, ...]:
 
 
 def check_recording_file(path: Path) -> None:
-    """Raise ``RecordingError`` if there is no such file."""
+    """Raise ``RecordingError`` if there is no such file, or if it is known to be of another kind."""
     if is_folder(path):
         from spherloc.datasets.given_path import what_it_is
 
         raise RecordingError(what_it_is(path))
+    if not is_recording(path) and (told := known_as(path)):
+        raise RecordingError(told)
     if not is_file(path):
         raise RecordingError(f"{path}: no such file; give the path of a recording (.rrd).")
 
 
 def check_recordings_folder(folder: Path) -> None:
-    """Raise ``InputError`` if there is no such folder of recordings."""
+    """Raise ``InputError`` if there is no such folder of recordings, or if it is known to be one of something else."""
     if not is_folder(folder):
-        raise InputError(f"{folder}: no such folder of recordings; run a scene first, or name another folder.")
+        raise InputError(
+            known_as(folder) or f"{folder}: no such folder of recordings; run a scene first, or name another folder."
+        )
+    if not _may_have_recordings(folder) and (told := known_as(folder)):
+        raise InputError(told)
+
+
+def known_as(path: Path) -> str:
+    """What a path is and which command takes it, if that is known; else empty."""
+    from spherloc.datasets.given_path import known_as  # only where it is needed: it takes a tenth of a second
+
+    return known_as(path)
+
+
+def _may_have_recordings(folder: Path) -> bool:
+    """Whether a folder, or one in it or in that, has recordings or a folder of that name, where results have them."""
+    names = names_in(folder)
+    if RECORDINGS_FOLDER in names or any(name.endswith(RECORDING) for name in names):
+        return True
+    for name in names:
+        inside = names_in(folder / name) if is_folder(folder / name) else []
+        if RECORDINGS_FOLDER in inside or any(one.endswith(RECORDING) for one in inside):
+            return True
+    return False
 
 
 def check_scene_file(path: Path) -> None:

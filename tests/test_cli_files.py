@@ -82,6 +82,40 @@ def test_a_missing_file_is_said_before_anything_large_is_imported(words: list[st
         assert sentence.startswith(f"spherloc: {name}: no such ")
 
 
+@pytest.mark.parametrize(
+    "words",
+    [["map"], ["view"], ["repeat"], ["label"], ["runs"], ["reindex"], ["rerun"], ["steps", "step = 1"], ["run"],
+     ["diagnose"], ["check-proof"]],
+    ids=lambda words: words[0],
+)  # fmt: skip
+def test_every_command_says_what_another_file_or_folder_is(words: list[str], tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    given = ("a.vrs", "database.db", "a.mp4", "photos/a.png", "photos/b.png", "a_logs.pkl", "a.docx")
+    for name in given:
+        (tmp_path / name).write_bytes(b"")
+    said = {name: "" for name in (*given, "photos")} | {
+        "a.vrs": "is a recording of Project Aria's glasses; save its images",
+        "database.db": "is a COLMAP database",
+        "a.mp4": "is a video; make a map of its frames with: spherloc map frames --video a.mp4",
+        "photos/a.png": "is an image; make a map of all images of its folder with: spherloc map photos",
+        "photos": "is a folder of 2 images; make a map of it with: spherloc map photos",
+        "a_logs.pkl": "is a pickle; if it is a log of hloc, say why its poses are wrong with: spherloc diagnose a_logs",
+    }
+    for name in given if words == ["map"] else said:
+        if (words[0], name) != ("diagnose", "a_logs.pkl"):
+            told = one_sentence(spherloc_here(*words, name, cwd=tmp_path))
+            assert told.startswith(f"spherloc: {name}: {said[name]}")
+    assert not list(tmp_path.rglob("*.sqlite")), "no list of runs among photographs"
+
+
+def test_runs_of_results_are_no_folder_of_pictures(tmp_path: Path) -> None:
+    """Where results are, pictures of trajectories are, too."""
+    for name in ("one/trajectory.png", "two/trajectory.png", "two/recordings/a.txt"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert "no run matches, of 0 runs in ." in spherloc_here("runs", ".", cwd=tmp_path).stderr
+
+
 @pytest.mark.parametrize("command", ["", *commands()])
 def test_help_tells_no_union_of_types(command: str) -> None:
     """Such as {None}|STR of a flag that may be left out."""

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cli_process import spherloc
+from cli_process import spherloc, spherloc_here
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recording_samples import scene_problem
 
 from spherloc.errors import InputError
+from spherloc.formats.colmap_files import read_model
 from spherloc.formats.hloc_log import LoggedQuery, read_log, read_log_poses
 from spherloc.formats.pickle_data import Noted, PickleDataError, read_pickle_data, value_of
 from spherloc.trajectory import wxyz_from_rotation
@@ -190,6 +191,30 @@ def test_queries_that_cannot_be_used_say_why(changes: dict[str, Any], said: str,
     path.write_bytes(pickle.dumps(logged(**changes)))
     (error,) = read_log(path, None).values()
     assert isinstance(error, InputError) and said in str(error) and str(error).startswith(f"{path}: 'q/a.jpg'")
+
+
+def test_a_query_without_a_camera_has_that_of_its_image_in_the_model_or_the_one_that_is_given(tmp_path: Path) -> None:
+    """As newer versions of hloc write them."""
+    pose, camera = PROBLEM.truth_cam_from_map, PROBLEM.camera
+    assert pose is not None
+    entry = logged(PnP_ret={"cam_from_world": pycolmap.Rigid3d(pose)})["loc"]["q/a.jpg"]
+    (tmp_path / "logs.pkl").write_bytes(pickle.dumps({"loc": {"q/a.jpg": entry, "other.jpg": entry}}))
+    size = f"{camera.width // 2} {camera.height // 2}"
+    (tmp_path / "cameras.txt").write_text(f"1 EQUIRECTANGULAR {size} {size}\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 q/a.jpg\n\n")
+    (tmp_path / "points3D.txt").write_text("")
+    found = read_log(tmp_path / "logs.pkl", read_model(tmp_path), camera)
+    assert [query.camera.width for query in found.values() if isinstance(query, LoggedQuery)] == [
+        camera.width // 2,
+        camera.width,
+    ]
+    alone = read_log(tmp_path / "logs.pkl", read_model(tmp_path))
+    assert isinstance(alone["q/a.jpg"], LoggedQuery) and "by --camera" in str(alone["other.jpg"])
+    (tmp_path / "camera.toml").write_text(
+        f'[camera]\nmodel = "equirectangular"\nwidth = {camera.width}\nheight = {camera.height}\n'
+    )
+    told = spherloc_here("diagnose", "logs.pkl", "--camera", "camera.toml", "--no-record", cwd=tmp_path)
+    assert "q/a.jpg: " in told.stdout and "other.jpg: " in told.stdout and "left out" not in told.stderr
 
 
 def test_a_log_is_diagnosed_without_a_scene(tmp_path: Path) -> None:

@@ -10,10 +10,12 @@ from spherloc.datasets.failures import failure_case
 from spherloc.diagnosis import Cause, diagnose
 from spherloc.estimators import default_options, estimate
 from spherloc.estimators.base import options_type
+from spherloc.free_gravity import MIN_LEAD, lead
 from spherloc.geometry import yaw_rotation
 from spherloc.metrics import evaluate
 from spherloc.outcome import Outcome, judge
 from spherloc.problem import Problem
+from spherloc_viz.app.text import ToldBeside, summary_html
 
 
 def solved(problem, estimator="ransac-2p", **options):
@@ -47,6 +49,21 @@ def test_what_speaks_against_a_pose(cause, words):
     assert len(doubts) >= 5
     assert sum(words in " ".join(one.reasons) for one in doubts) >= 4
     assert all((one.score < 0.0) == bool(one.reasons) for one in judged)
+
+
+@pytest.mark.parametrize("moved, outcome", [(0, "localized"), (45, "localized"), (75, "doubtful")])
+def test_two_poses_that_stand_out_are_not_called_localized(scene_of, moved, outcome):
+    """Part of the matches are of the same structure 4 m beside; the outcome and the diagnosis say the same."""
+    problem = scene_of("mei", correspondences=200, outlier_rate=0.0).problem(3)
+    points = problem.points.copy()
+    points[:moved] += [4.0, 0.0, 0.0]
+    unknown = {"truth_cam_from_map": None, "truth_inliers": None}
+    trace = solved(replace(problem, points=points, **unknown))
+    assert lead(200 - moved, moved) > MIN_LEAD
+    assert judge(trace).outcome == outcome
+    assert (diagnose(trace).cause is Cause.OK) == (outcome == "localized")
+    told = summary_html(trace, ToldBeside("gravity prior off"))
+    assert ("Localized, but in doubt: gravity prior off" in told) == (outcome == "localized")
 
 
 def test_degenerate_poses_are_doubtful():

@@ -10,7 +10,7 @@ import yaml
 
 from spherloc.cameras._checks import coefficients, finite, located
 from spherloc.errors import MAX_REASON, CalibrationError, InputError, reason, shorten, show
-from spherloc.files import names_in, read_file
+from spherloc.files import is_file, is_image, names_in, read_file
 
 CALIBRATION_NAME = re.compile(r"(calib|cam|lens|sensors|transforms).*\.(json|toml|txt|xml|ya?ml)$", re.IGNORECASE)
 """Usual names of calibration files."""
@@ -48,6 +48,8 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.const
 
 def read_text(path: Path) -> str:
     """The text of a calibration file; raises ``CalibrationError`` if it is missing, not text, or too large."""
+    if is_image(path.name) and is_file(path):
+        raise CalibrationError("is an image: give the file with the calibration of its camera.")
     try:
         content = read_file(path, MAX_FILE_BYTES)
     except FileNotFoundError:

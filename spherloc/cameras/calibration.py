@@ -43,7 +43,7 @@ _ONE_CAMERA = {
 _YAML_KEY = re.compile(r"""["']?[\w.-]+["']?\s*:(\s|$)""")
 
 
-def load_camera(path: str | Path, name: str | None = None) -> Camera:
+def load_camera(path: str | Path, name: str | None = None, size: tuple[int, int] | None = None) -> Camera:
     """The camera that a calibration file describes.
 
     The kind is recognised by the content: a KITTI-360 YAML (``model_type: MEI``), a Kalibr camchain (``cam0``, ...:
@@ -52,15 +52,15 @@ def load_camera(path: str | Path, name: str | None = None) -> Camera:
     (``distortion_coefficients``), a Basalt JSON (``value0``), a JSON of cameras by name (``model``, ``params``),
     nerfstudio's ``transforms.json`` (``fl_x``), COLMAP's ``cameras.txt``, OCamCalib's ``calib_results.txt`` and a TOML
     with a ``[camera]`` table or with its keys at the top. ``name`` picks one of ``camera_names``, by default the first
-    one. Principal points that count from the centre of the top-left pixel are
-    moved by +0.5 pixels to this project's convention (that centre is (0.5, 0.5)). A file of another kind is given to
-    the readers of extensions (docs/extending.md).
+    one. ``size`` is that of the images, px, for a file of OpenCV that does not state it. Principal points that count
+    from the centre of the top-left pixel are moved by +0.5 pixels to this project's convention (that centre is
+    (0.5, 0.5)). A file of another kind is given to the readers of extensions (docs/extending.md).
 
     Raises ``CalibrationError``, naming the file and the place, for whatever cannot be read as a usable camera.
     """
     with located(str(path)):
         try:
-            return _own_kind(Path(path), name)
+            return _own_kind(Path(path), name, size)
         except UnrecognisedError as error:
             return read_by_extensions(Path(path), name, str(error))
 
@@ -102,13 +102,13 @@ def camera_from_table(table: Any, where: str) -> Camera:
         raise CalibrationError(str(error)) from error
 
 
-def _own_kind(path: Path, name: str | None) -> Camera:
+def _own_kind(path: Path, name: str | None, size: tuple[int, int] | None) -> Camera:
     """The camera of a file of a kind that spherloc itself reads; raises ``UnrecognisedError`` for another kind."""
     text = read_text(path)
     if text.lstrip().startswith("{"):
-        return _from_json(parse_json(text), name)
+        return _from_json(parse_json(text), name, size)
     if text.lstrip().startswith("<"):
-        return _one_camera(parse_opencv_xml(text), name, "XML")
+        return _one_camera(parse_opencv_xml(text), name, "XML", size)
     if ocam_files.is_ocam(text):
         _refuse_name(name)
         return ocam_files.ocam(text)
@@ -116,7 +116,7 @@ def _own_kind(path: Path, name: str | None) -> Camera:
     if cameras:
         return colmap_text(cameras, name)
     if _looks_like_yaml(text):
-        return _from_yaml(parse_yaml(text), name)
+        return _from_yaml(parse_yaml(text), name, size)
     return _from_toml(text, name)
 
 
@@ -127,7 +127,7 @@ def _looks_like_yaml(text: str) -> bool:
     return first.startswith(("%", "---")) or _YAML_KEY.match(first) is not None
 
 
-def _from_json(document: Any, name: str | None) -> Camera:
+def _from_json(document: Any, name: str | None, size: tuple[int, int] | None) -> Camera:
     if isinstance(document, dict) and "value0" in document:
         return tool_files.basalt(document, name)
     if json_files.named_cameras(document):
@@ -135,10 +135,10 @@ def _from_json(document: Any, name: str | None) -> Camera:
     if json_files.is_transforms(document):
         _refuse_name(name)
         return json_files.transforms(document)
-    return _one_camera(document, name, "JSON")
+    return _one_camera(document, name, "JSON", size)
 
 
-def _from_yaml(document: Any, name: str | None) -> Camera:
+def _from_yaml(document: Any, name: str | None, size: tuple[int, int] | None) -> Camera:
     keys = {str(key) for key in document} if isinstance(document, dict) else set()
     if "model_type" in keys:
         return tool_files.kitti360(document, name)
@@ -148,10 +148,10 @@ def _from_yaml(document: Any, name: str | None) -> Camera:
             raise CalibrationError(f"has no camera {show(name)}: choose one of {', '.join(chain)}.")
         name = name or next(iter(chain))
         return tool_files.camera_of(name, chain[name])
-    return _one_camera(document, name, "YAML")
+    return _one_camera(document, name, "YAML", size)
 
 
-def _one_camera(document: Any, name: str | None, kind: str) -> Camera:
+def _one_camera(document: Any, name: str | None, kind: str, size: tuple[int, int] | None) -> Camera:
     """The camera of a document that has one, without a name; raises ``UnrecognisedError`` if it has no known key."""
     keys = {str(key) for key in document} if isinstance(document, dict) else set()
     if any(key.startswith(tool_files.STELLA_PREFIX) for key in keys):
@@ -159,7 +159,7 @@ def _one_camera(document: Any, name: str | None, kind: str) -> Camera:
     for mark, read in _ONE_CAMERA.items():
         if mark in keys:
             _refuse_name(name)
-            return read(document)
+            return opencv(document, size) if read is opencv else read(document)
     raise UnrecognisedError(f"this {kind} has no known key at its top: {KNOWN}.")
 
 

@@ -381,13 +381,17 @@ OPENCV_2 = {
 """Keys of the samples of OpenCV 2, and what they are called since."""
 
 
-def opencv(document: dict[Any, Any]) -> Camera:
+def opencv(document: dict[Any, Any], of_images: tuple[int, int] | None = None) -> Camera:
     """A pinhole, a fisheye (``fisheye_model: 1``, or ROS's ``distortion_model: equidistant``) or MEI (``xi``).
-    Its matrices are called as OpenCV's samples call them, or K and D.
+    Its matrices are called as OpenCV's samples call them, or K and D. ``of_images`` is the size, px, if it states none.
 
     Raises ``CalibrationError`` for another file, and if its four coefficients may be those of a fisheye or a pinhole.
     """
     document = {OPENCV_2.get(key, key): value for key, value in document.items()}
+    if not document.keys() & {"image_width", "image_height"}:
+        if of_images is None:
+            raise CalibrationError("states no size of images: add the keys image_width and image_height.")
+        document |= {"image_width": of_images[0], "image_height": of_images[1]}
     size = value_of(document, "image_width"), value_of(document, "image_height")
     matrix, coefficients = ("K", "D") if "D" in document else ("camera_matrix", "distortion_coefficients")
     with located(matrix):

@@ -1,4 +1,5 @@
-"""Recognizes a path that is not a scene file, such as a folder of images, and names the command that takes it."""
+"""Recognizes a path that a command does not take, such as a folder of images in the place of a scene file, and names
+the command that takes it."""
 
 import re
 import shlex
@@ -13,6 +14,7 @@ from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in, read_
 
 ARCHIVES = {".7z", ".bz2", ".gz", ".rar", ".tar", ".tgz", ".xz", ".zip"}
 VIDEOS = {".360", ".avi", ".insv", ".m4v", ".mkv", ".mov", ".mp4", ".webm"}
+PICKLES = {".pickle", ".pkl"}
 SCENE = "give the path of a scene file (TOML) or a bundled scene's name, which spherloc scenes lists"
 COMMAND = re.compile(r": spherloc [^;]*$")
 """A command at the end of a sentence."""
@@ -55,17 +57,32 @@ def what_it_is(path: Path) -> str:
     No full stop follows a command, so that it can be copied. Empty for a path that may be a scene file, and for one
     that does not exist.
     """
-    if is_folder(path):
-        what, advice = _folder(path)
-    elif is_file(path) and path.suffix.lower() != ".toml":
-        what, advice = _file(path)
-    else:
-        return ""
-    return f"{path}: is {what}; {advice}{'' if COMMAND.search(advice) else '.'}"
+    return "" if path.suffix.lower() == ".toml" and not is_folder(path) else _said(path, *_told(path))
+
+
+def known_as(path: Path) -> str:
+    """The same where a path is known to be something: a file of another kind than a scene, a scene file, or a folder
+    with something in it; else empty."""
+    what, advice = _told(path)
+    return "" if advice == SCENE else _said(path, what, advice.removesuffix(f"; else {SCENE}"))
+
+
+def _said(path: Path, what: str, advice: str) -> str:
+    return f"{path}: is {what}; {advice}{'' if COMMAND.search(advice) else '.'}" if what else ""
+
+
+def _told(path: Path) -> tuple[str, str]:
+    """What a path is, and what to do with it; empty for one that does not exist."""
+    return _folder(path) if is_folder(path) else _file(path) if is_file(path) else ("", "")
 
 
 def _file(path: Path) -> tuple[str, str]:
     suffix, folder = path.suffix.lower(), _quoted(path.parent)
+    if suffix in PICKLES:
+        advice = f"if it is a log of hloc, say why its poses are wrong with: spherloc diagnose {_quoted(path)}"
+        return "a pickle", f"{advice} --model MODEL"
+    if suffix in (".rrd", ".toml"):
+        return "a recording" if suffix == ".rrd" else "a TOML file", f"open it with: spherloc play {_quoted(path)}"
     if suffix in IMAGES:
         return "an image", f"make a map of all images of its folder with: spherloc map {folder}"
     if suffix in ARCHIVES:

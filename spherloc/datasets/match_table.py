@@ -91,14 +91,15 @@ def read_match_table(path: Path, camera: Path, gravity: Path | None, gravity_map
 
 
 def read_logged_matches(
-    path: Path, model: Path | None, gravity: Path | None, gravity_map: tuple[float, ...]
+    path: Path, model: Path | None, camera: Path | None, gravity: Path | None, gravity_map: tuple[float, ...]
 ) -> tuple[MatchTable, tuple[InputError, ...]]:
     """The matches in hloc's log of queries that were localized, and what is wrong with those that cannot be used.
 
-    ``model`` is the folder of the map's COLMAP model, which newer logs need. Raises ``InputError`` as
-    ``read_match_table`` does.
+    ``model`` is the folder of the map's COLMAP model, which newer logs need, and ``camera`` the calibration of queries
+    that have no camera in the log and are no images of the model. Raises ``InputError`` as ``read_match_table`` does.
     """
-    told = read_log(path, None if model is None else read_model(model))
+    one = None if camera is None else load_camera(camera)
+    told = read_log(path, None if model is None else read_model(model), one)
     queries = {name: query for name, query in told.items() if isinstance(query, LoggedQuery)}
     matches = {name: (np.hstack([query.pixels, query.points]), None) for name, query in queries.items()}
     cameras = {name: query.camera for name, query in queries.items()}

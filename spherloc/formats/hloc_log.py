@@ -56,17 +56,20 @@ def read_log_poses(path: Path) -> dict[str, FloatArray]:
     return poses
 
 
-def read_log(path: Path, model: ColmapModel | None) -> dict[str, LoggedQuery | InputError]:
+def read_log(
+    path: Path, model: ColmapModel | None, camera: Camera | None = None
+) -> dict[str, LoggedQuery | InputError]:
     """Pose and matches of each query that was localized, or why they cannot be used.
 
-    ``model`` is the COLMAP model of the map, which newer logs need, since they have only the ids of points. Raises
+    ``model`` is the COLMAP model of the map, which newer logs need, since they have only the ids of points. A query of
+    which the log states no camera has that of the model's image of its name; if there is none, ``camera``. Raises
     ``InputError`` for another file.
     """
     found: dict[str, LoggedQuery | InputError] = {}
     for name, entry, place in _localized(path):
         try:
             with _placed(place):
-                found[name] = _query(entry, model, place)
+                found[name] = _query(name, entry, model, camera, place)
         except InputError as error:
             found[name] = error
     return found
@@ -112,13 +115,24 @@ def _table(found: Any) -> Mapping[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _query(entry: Mapping[str, Any], model: ColmapModel | None, place: str) -> LoggedQuery:
+def _query(
+    name: str, entry: Mapping[str, Any], model: ColmapModel | None, camera: Camera | None, place: str
+) -> LoggedQuery:
     pixels = _floats(entry.get("keypoints_query"), 2, f"{place}: keypoints_query")
     points = _points(entry, model, place)
     if len(points) != len(pixels):
         raise InputError(f"{place}: has {len(pixels):,} keypoints but {len(points):,} points.")
     known = np.isfinite(points).all(axis=1)
-    return LoggedQuery(_pose(entry, place), pixels[known], points[known], _camera(entry, place))
+    pose, stated = _pose(entry, place), _camera(entry, place)
+    if stated is None and model is not None and name in model.images:
+        stated = model.camera(model.images[name].camera_id)
+    stated = stated or camera
+    if stated is None:
+        raise InputError(
+            f"{place}: has no camera, and is no image of a model that is given; give its calibration by --camera, or a "
+            "scene file of kind hloc instead, which names the cameras."
+        )
+    return LoggedQuery(pose, pixels[known], points[known], stated)
 
 
 def _pose(entry: Mapping[str, Any], place: str) -> FloatArray:
@@ -149,7 +163,8 @@ def _points(entry: Mapping[str, Any], model: ColmapModel | None, place: str) -> 
     return model.point_xyz(np.array(numbers, dtype=np.int64))
 
 
-def _camera(entry: Mapping[str, Any], place: str) -> Camera:
+def _camera(entry: Mapping[str, Any], place: str) -> Camera | None:
+    """The camera that the log states; None if it states none."""
     result = _table(entry.get("PnP_ret"))
     told = _table(result.get("camera")) or _table(result.get("cfg"))
     model = told.get("model")
@@ -158,7 +173,7 @@ def _camera(entry: Mapping[str, Any], place: str) -> Camera:
         model = MODELS[number][0] if isinstance(number, int) and 0 <= number < len(MODELS) else None
     width, height = value_of(told.get("width")), value_of(told.get("height"))
     if not isinstance(model, str) or not isinstance(width, int) or not isinstance(height, int):
-        raise InputError(f"{place}: has no camera; give a scene file of kind hloc instead, which names the cameras.")
+        return None
     params = _numbers(told.get("params"), None, f"{place}: params")
     try:
         return camera_from_colmap(model, width, height, tuple(params), place)

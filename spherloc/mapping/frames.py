@@ -1,6 +1,8 @@
 """Which images of a recording are mapped: the sharpest of each stretch of a video or of an image sequence."""
 
+import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import ceil, log
@@ -22,6 +24,8 @@ MAX_IMAGES = 500
 """Largest number of images of a map: the features of each take 4 MB."""
 FRAMES = 40
 """Number of images of a camera that are chosen if the user gives none."""
+FFMPEG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
+"""Environment variable of OpenCV: how much FFmpeg prints."""
 MAX_WHOLE, MAX_STEP_S = 100, 0.5
 """A camera that took more than ``MAX_WHOLE`` images, by the times in their names one every ``MAX_STEP_S`` seconds or
 more often (median), recorded a sequence, of which images are chosen."""
@@ -195,7 +199,8 @@ def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], No
     """
     if not is_file(video):
         raise InputError(f"{video}: is not a file; give a video.")
-    reader = cv2.VideoCapture(str(video))
+    with _without_lines_of_ffmpeg():
+        reader = cv2.VideoCapture(str(video))
     total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
     if total <= 0:
         raise InputError(f"{video}: OpenCV cannot read it as a video; convert it, to MP4 with H.264 for instance.")
@@ -217,6 +222,20 @@ def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], No
         written += 1
         advance(name)
     return written
+
+
+@contextmanager
+def _without_lines_of_ffmpeg() -> Iterator[None]:
+    """Where a first video is opened, keep FFmpeg from printing lines of its own, unless the user's environment sets how
+    much it prints."""
+    if FFMPEG_LEVEL in os.environ:
+        yield
+        return
+    os.environ[FFMPEG_LEVEL] = "-8"  # FFmpeg's AV_LOG_QUIET; OpenCV reads it once
+    try:
+        yield
+    finally:
+        os.environ.pop(FFMPEG_LEVEL, None)
 
 
 def _sharpest(reader: cv2.VideoCapture, stretch: int) -> Iterator[tuple[int, ByteArray]]:

@@ -11,6 +11,7 @@ from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.carried import carried_nadir_deg
+from spherloc.mapping.kept_models import forget, kept_or_made
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.line_gravity import GravityByLines, gravity_by_lines
 from spherloc.mapping.matched import DATABASES
@@ -131,6 +132,7 @@ def _folder_of_map(folder: Path) -> Iterator[None]:
         raise
     except SpherlocError:
         finished = (folder / SCENE).exists()
+        forget(folder)
         for path in folder.glob(DATABASES):
             if path not in before or not finished:
                 path.unlink(missing_ok=True)
@@ -155,7 +157,10 @@ def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
     known = {} if stated is None else stated.found
     lines = gravity_by_lines(views, tell, known)
     believed = {**known, **({} if lines.unsure else lines.found)}
-    first, *others = reconstruct(views, [believed.get(view.name) for view in views], folder, tell, request.how)
+    down = [believed.get(view.name) for view in views]
+    first, *others = kept_or_made(
+        views, down, folder, request.how, lambda: reconstruct(views, down, folder, tell, request.how)
+    )
     lines = lines.in_map(first.poses, first.points())
     gravity = {**known, **lines.found}
     found = _finished(first, views, nearer_to_others(first, others), gravity, measured, tell)

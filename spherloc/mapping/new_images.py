@@ -6,9 +6,9 @@ from pathlib import Path
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.datasets.given_path import ARCHIVES, what_it_is
+from spherloc.datasets.given_path import known_as
 from spherloc.errors import InputError
-from spherloc.files import is_file, is_folder, is_image, names_in
+from spherloc.files import is_folder, is_image, names_in
 from spherloc.frontend.view import Gravity, View
 from spherloc.images import read_size
 from spherloc.mapping.frames import FrameChoice
@@ -48,10 +48,10 @@ def new_images_of(
     of the map that has their size, which ``with_cameras`` tells by their names where it has several; others of 2 to 1
     are panoramas. Raises ``InputError`` if there is no image, or none whose camera is known.
     """
-    if is_file(folder) and folder.suffix.lower() in ARCHIVES:
-        raise InputError(what_it_is(folder))
     if not is_folder(folder):
-        raise InputError(f"{folder}: is not a folder; give one with images that are to be localized.")
+        raise InputError(
+            known_as(folder) or f"{folder}: is not a folder; give one with images that are to be localized."
+        )
     different = cameras_of(mapped.views)
     only = next(iter(different.values())) if len(different) == 1 else None
     choice = replace(choice, mapped=frozenset(view.path.resolve() for view in mapped.views))

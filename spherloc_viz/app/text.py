@@ -194,7 +194,7 @@ def summary_html(trace: Trace, beside: ToldBeside = ToldBeside()) -> str:
     """A run in one line, and sentences on where its query was taken and what other queries say of it."""
     cause, together = beside.cause, beside.together
     words, facts = summary_of(trace)
-    doubt = ", but in doubt" if cause and words == "success" else ""
+    doubt = ", but in doubt" if cause and words in ("success", Outcome.LOCALIZED) else ""
     told = f"{words.capitalize()}{doubt}: {cause}" if cause else words.capitalize()
     # In a narrow line the time stands alone; under a resting pointer it says what it is the time of.
     shown = (

@@ -24,6 +24,7 @@ from spherloc_viz.commands.flags import (
     OptionalText,
     Settings,
 )
+from spherloc_viz.given_files import known_as
 from spherloc_viz.importing import importing
 
 
@@ -174,7 +175,8 @@ def diagnose(
             (kind "correspondences"), named by the problem, its image or the file. None with --matches.
         matches: The matches of all queries instead of scenes: a CSV with the columns name, u, v (px), X, Y, Z, and
             inlier (0 or 1) where that is known.
-        camera: The calibration file of these queries.
+        camera: The calibration file of these queries; with hloc's log, of those that have no camera in it and are no
+            images of the model.
         model: The COLMAP model of the map, for a log of hloc without scenes, or with --database.
         database: COLMAP's database instead of scenes: the verified matches of all images that --model lacks. With
             --gravity those that COLMAP could not register are solved by auto and diagnosed too.
@@ -195,6 +197,11 @@ def diagnose(
         raise InputError(f"{poses}: no such file; give a file of poses, or the folder of a COLMAP model.")
     from spherloc.formats.hloc_log import is_log
 
+    takes = is_log(poses) or poses.suffix.lower() == ".csv"
+    if is_folder(poses):
+        takes = is_file(poses / "images.bin") or is_file(poses / "images.txt")
+    if not takes and (told := known_as(poses)):
+        raise InputError(told)
     own = matches is None and database is None and not scenes
     logged = own and is_log(poses)
     if (model is not None) != (database is not None) and not (logged and database is None):
@@ -203,10 +210,10 @@ def diagnose(
         raise InputError("the matches come from scenes, from --matches or from --database; give one of them.")
     if own and not logged:
         raise InputError("no scene given; name the scene files whose queries the poses are of, or give --matches.")
-    if (matches is None) != (camera is None) or (gravity is not None and scenes):
-        raise InputError(
-            "--matches needs --camera and goes with it only; --gravity does not go with scenes, which say that."
-        )
+    if (matches is not None and camera is None) or (scenes and (camera is not None or gravity is not None)):
+        raise InputError("--matches needs --camera; neither --camera nor --gravity goes with scenes, which say that.")
+    if camera is not None and database is not None:
+        raise InputError("--database has the cameras itself; leave out --camera.")
     files = [scene_path(scene) for scene in scenes]
     for file in files:
         check_there(file)
@@ -229,7 +236,7 @@ def diagnose(
     elif matches is not None and camera is not None:
         table = read_match_table(matches, camera, gravity, map_down)
     else:
-        table, wrong = read_logged_matches(poses, model, gravity, map_down)
+        table, wrong = read_logged_matches(poses, model, camera, gravity, map_down)
     for error in wrong:
         say(f"{error} It is left out.")
     return diagnose_poses(poses, [table], bound_px, label, json, kept)
@@ -307,10 +314,11 @@ def map(
     """
     import numpy as np
 
+    from spherloc.cameras.calibration import camera_names
     from spherloc.datasets.query_gravity import camera_from_imu as rotation_of
     from spherloc.frontend.masks import Masks
     from spherloc.mapping.make import ScaleMeasurement
-    from spherloc_viz.commands.map import MAX_METRES, cameras_of_file, distance_of, make
+    from spherloc_viz.commands.map import MAX_METRES, distance_of, make
 
     if sum(one is not None for one in (camera_height, distance or None, positions)) > 1:
         raise InputError("--camera-height, --distance and --positions all give the scale; keep one.")
@@ -328,11 +336,14 @@ def map(
     masked = any(one is not None for one in (mask, nadir, seam))
     masks = Masks(mask, nadir or 0.0, seam or 0.0) if masked else None
     measured = ScaleMeasurement(camera_height, apart)
-    cameras = cameras_of_file(camera, camera_name)
+    if camera is None and camera_name is not None:
+        raise InputError(f"--camera-name {shlex.quote(camera_name)} goes with --camera FILE; give that file too.")
+    if camera is not None:
+        camera_names(camera)  # before frames are taken from a video
     made = make(
         folder,
         output,
-        cameras,
+        None if camera is None else (camera, camera_name),
         video,
         measured,
         localize,

@@ -11,14 +11,13 @@ import shlex
 import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from spherloc.cameras.base import Camera
-from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.asl_layout import camera_of_folder
 from spherloc.datasets.scene_file import read_table
@@ -34,6 +33,7 @@ from spherloc.images import check_image, read_size
 from spherloc.mapping.advice import advice, for_a_page
 from spherloc.mapping.frames import FRAMES, FrameChoice, frames_of
 from spherloc.mapping.gravity_check import check_stated
+from spherloc.mapping.given_cameras import given_cameras
 from spherloc.mapping.kept_scale import FILE as SCALE_FILE
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
 from spherloc.mapping.make import Map, MapRequest, ScaleMeasurement, make_map
@@ -64,7 +64,8 @@ from spherloc.mapping.true_poses import truth_words
 from spherloc.registry import require
 from spherloc.types import FloatArray
 from spherloc_viz.commands.map_report import MAP_FEATURES, map_report, summary
-from spherloc_viz.commands.progress import progress, say
+from spherloc_viz.commands.progress import Advance, progress, say
+from spherloc_viz.given_files import known_as
 
 REPORT = "report.html"
 ESTIMATOR = "auto"
@@ -78,7 +79,7 @@ MAX_SIZES = 4
 def make(
     folder: Path,
     output: Path | None,
-    cameras: Mapping[str, Camera],
+    camera: tuple[Path, str | None] | None,
     video: Path | None,
     measured: ScaleMeasurement,
     new_images: Path | None,
@@ -93,19 +94,25 @@ def make(
 ) -> "Finished":
     """Make the map, and print the result; raises ``InputError``.
 
-    ``cameras`` are those of the calibration file by name; ``frames`` says how many images of ``folder`` are mapped, or
-    taken from the ``video`` into it. With ``panorama``, images of 2 to 1 are panoramas in any case. With
-    ``find_carried``, what moves with the camera below panoramas is left out, too. ``positions`` is a file of where the
-    images were taken, ``gravity`` one of their gravity, with the rotation (3, 3) from the IMU to the camera if it is
-    the log of an IMU, and ``features`` one of ``MAP_FEATURES``, the best installed if None.
+    ``camera`` is a calibration file, with the name of one of its cameras if all images have that. ``frames`` says how
+    many images of ``folder`` are mapped, or taken from the ``video`` into it. With ``panorama``, images of 2 to 1 are
+    panoramas in any case. With ``find_carried``, what moves with the camera below panoramas is left out, too.
+    ``positions`` is a file of where the images were taken, ``gravity`` one of their gravity, with the rotation (3, 3)
+    from the IMU to the camera if it is the log of an IMU, and ``features`` one of ``MAP_FEATURES``, the best installed
+    if None.
     """
     end_without_a_trace()
     how = how_of(features)
+    if not is_folder(folder) and (told := known_as(folder)):
+        raise InputError(told)
     target = output or Path(MAP_FOLDER.format(folder.resolve().name))
     check_images_of(target, folder)
     with _stages() as tell, _compiled_for(new_images):
         if video is not None:
             _take_frames(video, frames or FRAMES, folder, tell)
+        cameras, about_cameras = ({}, []) if camera is None else given_cameras(*camera, folder)
+        for remark in about_cameras:
+            say(remark)
         choice = FrameChoice(None if video is not None else frames, tell=tell)
         finder = _lens_finder(tell, folder, target, new_images)
         found = photographs(folder, cameras, masks, panorama, finder, choice)
@@ -257,18 +264,6 @@ def end_without_a_trace() -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
-def cameras_of_file(file: Path | None, name: str | None) -> dict[str, Camera]:
-    """The cameras of a calibration file by name, or the named one alone; none without a file."""
-    if file is None:
-        if name is not None:
-            raise InputError(f"--camera-name {shlex.quote(name)} goes with --camera FILE; give that file too.")
-        return {}
-    names = camera_names(file)
-    if name is not None or not names:
-        return {name or "": load_camera(file, name)}
-    return {one: load_camera(file, one) for one in names}
-
-
 def how_of(features: str | None = None) -> FrontendOptions:
     """Features with their usual matching, the best installed ones if None; raises ``InputError`` if they are unknown or
     not installed."""
@@ -307,7 +302,7 @@ def _compiled_for(new_images: Path | None) -> AbstractContextManager[None]:
 def _stages() -> Iterator[Tell]:
     """Progress of one kind of work after another."""
     with ExitStack() as stack:
-        running: dict[str, Callable[[str], None]] = {}
+        running: dict[str, Advance] = {}
         done = 0
 
         def tell(kind: str, number: int, count: int) -> None:
@@ -318,7 +313,7 @@ def _stages() -> Iterator[Tell]:
                 running[kind] = stack.enter_context(progress(count, kind))
                 done = 0
             while done < number:
-                running[kind]("")
+                running[kind]("", count)
                 done += 1
 
         yield tell

@@ -2,10 +2,10 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Protocol
 
 from tqdm import tqdm
 
@@ -27,29 +27,34 @@ def say(sentence: str) -> None:
     sys.stderr.flush()
 
 
-@contextmanager
-def progress(count: int, plural: str) -> Iterator[Callable[[str], None]]:
-    """A bar on a terminal, else a line now and then.
+class Advance(Protocol):
+    """Called after each piece of work."""
 
-    The function that it gives is called after each of ``count`` pieces of work ("queries") with a remark, which may be
-    empty.
-    """
+    def __call__(self, remark: str, count: int | None = None) -> None:
+        """``remark`` may be empty; ``count`` is the number of all pieces if that has changed."""
+        ...
+
+
+@contextmanager
+def progress(count: int, plural: str) -> Iterator[Advance]:
+    """A bar on a terminal, else a line now and then, of ``count`` pieces of work ("queries")."""
     if sys.stderr.isatty():
         with tqdm(total=count, unit=f" {plural}", file=sys.stderr, dynamic_ncols=True, delay=BAR_AFTER_S) as bar:
 
-            def advance(remark: str) -> None:
+            def advance(remark: str, count: int | None = None) -> None:
+                bar.total = bar.total if count is None else count
                 bar.set_postfix_str(remark, refresh=False)
                 bar.update()
 
             yield advance
         return
-    done, said = 0, time.monotonic()
+    done, total, said = 0, count, time.monotonic()
 
-    def line(remark: str) -> None:
-        nonlocal done, said
-        done += 1
+    def line(remark: str, count: int | None = None) -> None:
+        nonlocal done, total, said
+        done, total = done + 1, total if count is None else count
         if time.monotonic() - said > LINE_EVERY_S:
-            say(f"{done:,} of {count:,} {plural}{f', {remark}' if remark else ''}.")
+            say(f"{done:,} of {total:,} {plural}{f', {remark}' if remark else ''}.")
             said = time.monotonic()
 
     yield line

@@ -23,6 +23,7 @@ from spherloc_viz.given_files import (
     check_recording_file,
     check_recordings_folder,
     is_recording,
+    known_as,
     none_there,
     without_reviews,
 )
@@ -417,6 +418,8 @@ def check_proof(file: Positional[Path], /) -> int:
     """
     from spherloc.proof_check import Refused, check
 
+    if file.suffix.lower() != ".npz" and (told := known_as(file)):
+        raise InputError(told)
     try:
         print(check(file))
     except Refused as refused:

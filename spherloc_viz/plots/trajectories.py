@@ -17,7 +17,7 @@ from matplotlib.patches import Rectangle
 
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import shorten
-from spherloc.experiments.results import DOUBTFUL, FAILED, POSED, SequenceResults
+from spherloc.experiments.results import DOUBTFUL, FAILED, LOCALIZED, POSED, SequenceResults
 from spherloc.experiments.summary import timed
 from spherloc.geometry import align_to_down, camera_centre
 from spherloc.types import BoolArray, FloatArray
@@ -304,8 +304,11 @@ def _one_of_several(
     errors_m, _, limit_m = _errors(results)
     inside = np.isfinite(seen).all(axis=1) & _inside(axes, seen)
     with_truth = np.isfinite(true_places).all(axis=1)
-    limit = f"{limit_m:g} {results.configuration.unit}"
-    words = f"{label}: {np.count_nonzero(errors_m <= limit_m)} of {len(seen)} within {limit}"
+    if np.isfinite(errors_m).any():
+        limit = f"{limit_m:g} {results.configuration.unit}"
+        words = f"{label}: {np.count_nonzero(errors_m <= limit_m)} of {len(seen)} within {limit}"
+    else:  # there is no truth
+        words = f"{label}: {results.status.count(LOCALIZED)} of {len(seen)} localized"
     line, color = "-" if timed(results) else "none", style.color
     axes.plot(
         *seen[inside].T, color=color, linestyle=line, linewidth=0.9, marker=style.marker, markersize=style.size,

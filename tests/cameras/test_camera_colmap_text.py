@@ -5,7 +5,7 @@ import pytest
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.errors import CalibrationError
-from spherloc_viz.commands.map import cameras_of_file
+from spherloc.mapping.given_cameras import given_cameras
 
 TWO = """# Camera list with one line of data per camera:
 #   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
@@ -42,10 +42,9 @@ def test_a_line_that_cannot_be_used_is_named(tmp_path, line, said):
 def test_a_map_gets_the_cameras_of_a_file_by_name(tmp_path):
     path = tmp_path / "cameras.txt"
     path.write_text(TWO)
-    found = cameras_of_file(path, None)
-    assert list(found) == ["1", "3"] and found["1"] == FIRST
-    assert list(cameras_of_file(path, "3").values()) == [found["3"]]
-    assert cameras_of_file(None, None) == {}
+    found, remarks = given_cameras(path, None, tmp_path)
+    assert list(found) == ["1", "3"] and found["1"] == FIRST and not remarks
+    assert given_cameras(path, "3", tmp_path) == ({"3": found["3"]}, [])
 
 
 KAPTURE = """# kapture format: 1.1

@@ -138,6 +138,14 @@ def test_the_picture_of_several_estimators_has_the_map(figure_of):
     assert any(text.get_text() == "lost.png" for text in figure.axes[-1].texts)
 
 
+def test_several_estimators_are_compared_by_errors_where_there_is_truth_else_by_what_is_localized(figure_of):
+    posed, doubted = query(0, "a.png", -2.0, -2.0), replace(query(1, "b.png", 2.0, 1.0), status="doubtful")
+    legend = legend_of(figure_of(trajectories_png, [("mc", results(posed, doubted)), ("other", results(posed))], ROOM))
+    assert {"mc: 1 of 2 localized", "other: 1 of 1 localized"} <= set(legend)
+    right = replace(posed, truth_cam_from_map=posed.cam_from_map, rotation_error_deg=0.1, translation_error_m=0.05)
+    assert "mc: 1 of 2 within 0.5 m" in legend_of(figure_of(trajectories_png, [("mc", results(right, doubted))], ROOM))
+
+
 def test_unordered_photographs_are_not_joined(figure_of):
     rows = [query(k, f"{k}.png", 2.0 * k - 4.0, 0.0) for k in range(3)]
     rows = [replace(row, truth_cam_from_map=row.cam_from_map) for row in rows]

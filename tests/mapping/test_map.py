@@ -2,6 +2,7 @@
 
 import copy
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -33,6 +34,8 @@ from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.advice import COMMAND, PAGE, for_a_page
 from spherloc.mapping.frames import frames_of
 from spherloc.mapping.full_panorama import two_circles
+from spherloc.mapping.given_cameras import given_cameras
+from spherloc.mapping.kept_models import FILE as KEPT_MODELS
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.line_gravity import gravity_by_lines
@@ -61,8 +64,8 @@ from spherloc_viz.commands.map import (
     _kind,
     _of_the_map_before,
     _sizes,
+    _stages,
     _take_frames,
-    cameras_of_file,
     distance_of,
     how_of,
     main,
@@ -305,7 +308,42 @@ def test_what_is_done_is_not_done_again(walk):
     assert repeated.written.poses.keys() == made.written.poses.keys()
     assert len(repeated.written.points) == len(made.written.points)
     for name, pose in made.written.poses.items():
-        np.testing.assert_allclose(repeated.written.poses[name], pose, atol=1e-9)
+        np.testing.assert_array_equal(repeated.written.poses[name], pose)
+    np.testing.assert_array_equal(repeated.written.points, made.written.points)
+
+
+def test_models_are_kept_for_the_same_photographs_only(walk, tmp_path, monkeypatch):
+    """Another scale takes them, too; a photograph that changed, another gravity, or a damaged file does not."""
+    _, found, made, _, _, output = walk
+    folder, images = tmp_path / "map", tmp_path / "photographs"
+    shutil.copytree(output, folder)
+    shutil.copytree(found.views[0].path.parent, images)  # with the times of the files
+    views = [replace(view, path=images / view.path.name) for view in found.views]
+    content = (folder / KEPT_MODELS).read_bytes()
+
+    def asked(changed, stated=None):
+        (folder / KEPT_MODELS).write_bytes(content)
+        return make_map(MapRequest(changed, images, masks=Masks(nadir_deg=12.0), stated=stated), folder)
+
+    def refuse(*_):
+        raise InputError("made again")
+
+    monkeypatch.setattr("spherloc.mapping.make.reconstruct", refuse)
+    unscaled = asked(views)
+    assert not unscaled.scale.source
+    share = np.linalg.norm(unscaled.written.points, axis=1) / np.linalg.norm(made.written.points, axis=1)
+    np.testing.assert_allclose(share, share[0])
+    gravity = tmp_path / "gravity.txt"
+    gravity.write_text("".join(f"{view.name} 0 1 0\n" for view in views))
+    for change in ("gravity", "photograph", "damage"):
+        if change == "photograph":
+            os.utime(views[0].path, (1.0, 1.0))
+        if change == "damage":
+            shutil.copystat(found.views[0].path, views[0].path)
+            content = content[:2000] + bytes(100) + content[2100:]
+        with pytest.raises(InputError, match="made again"):
+            asked(views, read_stated_gravity(gravity, None, views) if change == "gravity" else None)
+        assert not (folder / KEPT_MODELS).exists()
 
 
 def test_the_report_says_what_is_in_the_map(walk):
@@ -471,7 +509,7 @@ def test_folders_have_the_cameras_of_their_numbers(tmp_path, rng):
         "cam07: The calibration found beside them: 007.",
         "cam10: The calibration found beside them: 010.",
     )
-    given = cameras_of_file(tmp_path / "sensors.txt", None)
+    given, _ = given_cameras(tmp_path / "sensors.txt", None, tmp_path)
     assert [view.camera.fx for view in photographs(tmp_path, given).views] == [90.0, 95.0]
     (tmp_path / "cam07").rename(tmp_path / "cam09")
     found = photographs(tmp_path, {})
@@ -747,6 +785,33 @@ def test_frames_of_a_video_are_its_sharpest(tmp_path, rng, capsys):
     with pytest.raises(InputError, match="cannot read it as a video"):
         frames_of(tmp_path / "text.mp4", tmp_path / "frames", 3, names.append)
     assert not (tmp_path / "frames").exists()
+
+
+def test_a_video_without_an_end_is_one_sentence(tmp_path):
+    """FFmpeg prints no line of its own before it; in a process of its own, as OpenCV sets that once."""
+    (tmp_path / "cut.mp4").write_bytes(b"\0\0\0\x14ftypisom\0\0\2\0isom" + b"\0\0\0\x10mdat" + bytes(8))
+    script = (
+        "import os\nfrom pathlib import Path\nfrom spherloc.errors import InputError\n"
+        "from spherloc.mapping.frames import frames_of\nbefore = dict(os.environ)\n"
+        "try:\n    frames_of(Path('cut.mp4'), Path('frames'), 3, print)\n"
+        "except InputError as error:\n    print(error, os.environ == before)"
+    )
+    environment = {key: value for key, value in os.environ.items() if key != "OPENCV_FFMPEG_LOGLEVEL"}
+    environment["PYTHONPATH"] = str(Path(__file__).parents[2])
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=LIMIT_S)
+    assert done.stdout.startswith("cut.mp4: OpenCV cannot read it as a video") and done.stdout.endswith("True\n")
+    assert done.stderr == ""
+
+
+def test_progress_follows_a_number_of_pieces_that_grows(monkeypatch, capsys):
+    """As that of joins of maps, whose number is not known before."""
+    monkeypatch.setattr("spherloc_viz.commands.progress.LINE_EVERY_S", -1.0)
+    with _stages() as tell:
+        for number in range(1, 4):
+            tell("joins of maps tried", number, number)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [f"spherloc: {number} of {number} joins of maps tried." for number in range(1, 4)]
 
 
 def test_a_lens_that_colmap_lacks_is_fitted():

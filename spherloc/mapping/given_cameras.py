@@ -1,0 +1,75 @@
+"""The cameras of a calibration file that a user gives for photographs of known sizes."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from spherloc.cameras.base import Camera
+from spherloc.cameras.calibration import camera_names, load_camera
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.cameras.scaling import scaled
+from spherloc.errors import CalibrationError, InputError, show
+from spherloc.files import is_folder, is_image, names_in
+from spherloc.images import read_size
+
+Size = tuple[int, int]
+"""Width and height, px."""
+
+
+def given_cameras(file: Path, name: str | None, folder: Path) -> tuple[dict[str, Camera], list[str]]:
+    """The cameras of a calibration file by name, or the named one alone, for photographs in ``folder``, and remarks.
+
+    If none has the size of a photograph, those of the same shape are scaled to the most frequent size. If a file states
+    no size, and the photographs have one, it is that. Raises ``CalibrationError`` for a file that cannot be used.
+    """
+    sizes = _sizes_in(folder)
+    names: Sequence[str | None] = [name] if name is not None else camera_names(file)
+    cameras, remarks = dict[str, Camera](), list[str]()
+    for one in names or (None,):
+        try:
+            cameras[one or ""] = load_camera(file, one)
+        except CalibrationError:
+            if len(sizes) != 1:
+                raise
+            (size,) = sizes
+            cameras[one or ""] = load_camera(file, one, size)
+            remarks.append(f"{file}: states no size of images; {_px(size)}, that of the photographs, are taken.")
+    if sizes and not any((camera.width, camera.height) in sizes for camera in cameras.values()):
+        cameras, about = _scaled(file, cameras, sizes.most_common(1)[0][0])
+        remarks += about
+    return cameras, remarks
+
+
+def _scaled(file: Path, cameras: Mapping[str, Camera], size: Size) -> tuple[dict[str, Camera], list[str]]:
+    """The cameras, those of the shape of images of that size scaled to it, and remarks."""
+    found, remarks = dict(cameras), []
+    for name, camera in cameras.items():
+        smaller = None if isinstance(camera, Equirectangular) else scaled(camera, *size)
+        if smaller is not None:
+            found[name] = smaller
+            which = f", camera {show(name)}," if name else ""
+            remarks.append(
+                f"{file}{which}: is for images of {_px((camera.width, camera.height))}, and was scaled to {_px(size)}, "
+                "the size of the photographs. That is right if these were scaled, but not if they were cut."
+            )
+    return found, remarks
+
+
+def _sizes_in(folder: Path) -> Counter[Size]:
+    """How many images of each size there are in a folder or, if there are none, in the folders in it."""
+    names = names_in(folder) if is_folder(folder) else []
+    paths = [folder / name for name in names if is_image(name)]
+    if not paths:
+        inside = [folder / name for name in names if is_folder(folder / name)]
+        paths = [place / name for place in inside for name in names_in(place) if is_image(name)]
+    sizes = Counter[Size]()
+    for path in paths:
+        try:
+            sizes[read_size(path)] += 1
+        except InputError:  # told later, with all that is left out
+            continue
+    return sizes
+
+
+def _px(size: Size) -> str:
+    return f"{size[0]} x {size[1]} pixels"

@@ -1,0 +1,85 @@
+"""Calibration files that are given for photographs of another size, or that state none."""
+
+import cv2
+import numpy as np
+import pytest
+
+from spherloc.cameras.calibration import load_camera
+from spherloc.cameras.double_sphere import DoubleSphere
+from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.cameras.eucm import Eucm
+from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.cameras.mei import Mei
+from spherloc.cameras.scaling import scaled
+from spherloc.errors import CalibrationError
+from spherloc.mapping.given_cameras import given_cameras
+
+FOCAL = 1280, 960, 400.0, 402.0, 650.0, 470.0
+FISHEYE = KannalaBrandt(*FOCAL, (0.01, -0.002, 0.001, 0.0))
+OPENCV = """%YAML:1.0
+---
+K: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 400., 0., 319.5, 0., 400., 239.5, 0., 0., 1. ]
+D: !!opencv-matrix
+   rows: 4
+   cols: 1
+   dt: d
+   data: [ 0.01, -0.002, 0., 0. ]
+distortion_model: equidistant
+"""
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    """A folder of three photographs of 640 x 480 pixels."""
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for name in "abc":
+        cv2.imwrite(str(folder / f"{name}.png"), np.zeros((480, 640), np.uint8))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [FISHEYE, Mei(*FOCAL, 1.2, (0.1, -0.02, 0.001, 0.0)), DoubleSphere(*FOCAL, 0.1, 0.6), Eucm(*FOCAL, 0.6, 1.1)],
+    ids=lambda camera: camera.model,
+)
+def test_a_scaled_camera_sees_the_same(camera, rng):
+    pixels = rng.uniform((200.0, 200.0), (1000.0, 800.0), (20, 2))
+    for width, height in ((640, 480), (1920, 1440), (427, 320)):  # the last one is rounded
+        smaller = scaled(camera, width, height)
+        assert smaller is not None and (smaller.width, smaller.height) == (width, height)
+        bearings, seen = smaller.unproject(pixels * (width / 1280, height / 960))
+        assert seen.all()
+        np.testing.assert_allclose(bearings, camera.unproject(pixels)[0], atol=1e-9)
+    assert scaled(camera, 640, 640) is None and scaled(camera, 960, 1280) is None
+    assert scaled(Equirectangular(800, 400), 400, 200) is None, "a panorama of any size needs no calibration"
+
+
+def test_a_calibration_of_the_same_shape_is_scaled_and_told(tmp_path, photographs):
+    file = tmp_path / "big.toml"
+    file.write_text("[camera]\n" + "".join(f"{key} = {value!r}\n" for key, value in FISHEYE.to_dict().items()))
+    cameras, (said,) = given_cameras(file, None, photographs)
+    assert cameras == {"": scaled(FISHEYE, 640, 480)}
+    assert "is for images of 1280 x 960 pixels, and was scaled to 640 x 480 pixels" in said
+    cv2.imwrite(str(photographs / "big.png"), np.zeros((960, 1280), np.uint8))
+    assert given_cameras(file, None, photographs) == ({"": FISHEYE}, []), "some have its size"
+
+
+def test_a_file_of_opencv_without_a_size_has_that_of_the_photographs(tmp_path, photographs):
+    file = tmp_path / "kd.yml"
+    file.write_text(OPENCV)
+    cameras, (said,) = given_cameras(file, None, photographs)
+    assert cameras == {"": KannalaBrandt(640, 480, 400.0, 400.0, 320.0, 240.0, (0.01, -0.002, 0.0, 0.0))}
+    assert "states no size of images; 640 x 480 pixels, that of the photographs, are taken." in said
+    cv2.imwrite(str(photographs / "big.png"), np.zeros((960, 1280), np.uint8))
+    with pytest.raises(CalibrationError, match="states no size of images: add the keys image_width and image_height"):
+        given_cameras(file, None, photographs)
+
+
+def test_an_image_is_no_calibration(photographs):
+    with pytest.raises(CalibrationError, match=r"a\.png: is an image: give the file with the calibration"):
+        load_camera(photographs / "a.png")
