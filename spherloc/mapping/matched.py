@@ -28,6 +28,7 @@ from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.pairs import MIN_MATCHES, SURE, ImagePairs, relative
 from spherloc.mapping.parallel import Tell, as_completed
+from spherloc.mapping.rig import shots_of
 from spherloc.mapping.rotations import agreeing
 from spherloc.mapping.triangles import Pair, open_triangles
 from spherloc.registry import require
@@ -147,7 +148,9 @@ def match_all(
         raise StoppedError(f"{whole}: cannot be written ({reason(error)}); {advice('go on')}.") from None
     panoramas = all(isinstance(camera, Equirectangular) for camera in cameras)
     none_sure = not panoramas and max(sureness.values(), default=SURE) < SURE
-    sure = {pair: one for pair, one in found.items() if none_sure or sureness[pair] >= SURE}
+    together = not panoramas and bool(shots_of(views))  # what cameras took together tells which pairs are wrong
+    every = none_sure or together
+    sure = {pair: one for pair, one in found.items() if every or sureness[pair] >= SURE}
     with _database(pycolmap, whole) as database:
         between = _with_images_between(database, ids, compared, _agreeing(sure), at_one_place, tell)
     names = [view.name for view in views]

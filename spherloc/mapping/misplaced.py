@@ -2,8 +2,8 @@
 
 The rotation between two images with many matches is seldom wrong. COLMAP places an image by the points that are in the
 map at the time: if these are of a place that looks alike, or of one plane, the image is put elsewhere, and the pairs
-that would say so no longer count. And where clouds or other far things alone tell the distance, an image is put far away
-from all others.
+that would say so no longer count. And where clouds or other far things alone tell the distance, an image is put far
+away from all others.
 """
 
 from collections.abc import Mapping

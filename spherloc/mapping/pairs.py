@@ -51,6 +51,8 @@ MANY_FIT_LEARNED = 250
 SURE = 200.0
 """Of other images, which share a part of their view only, a pose is sure if so many matches fit it, times the cube of
 its peak: 60 matches with a peak of 1.5, or 25 with one of 2. ``benchmarks.headset --pairs`` shows why."""
+MANY_SURE = 70
+"""It is sure, too, if so many matches fit: on facades they fit many directions."""
 FAR = 1.0 / 3.0
 """Share of the matches that fit a rotation alone, from which on they may hide where the camera went."""
 NOT_FAR = 3.0
@@ -154,7 +156,7 @@ class ImagePairs:
         """How sure a pose is; it should be ``SURE``.
 
         Of panoramas 0 or infinity: whether what fits of the matches (M, 2) may be a thing that stands at two places. Of
-        others the number of those that fit, times the cube of the peak.
+        others the number of those that fit, times the cube of the peak, or times what makes ``MANY_SURE`` sure.
         """
         rays, pose = self._rays(first, second, pairs), relative(geometry)
         fits = fitting(*rays, *pose, self.bound_rad)
@@ -162,7 +164,7 @@ class ImagePairs:
         if all(isinstance(camera, Equirectangular) for camera in cameras):
             many = MANY_FIT_LEARNED if self._learned(first, second) else MANY_FIT
             return 0.0 if fit_on_one_thing(cameras, rays, fits, many) else np.inf
-        return np.count_nonzero(fits) * self.peak(first, second, pose) ** 3
+        return np.count_nonzero(fits) * max(self.peak(first, second, pose) ** 3, SURE / MANY_SURE)
 
     def peak(self, first: int, second: int, pose: Relative) -> float:
         """How many times as many guided matches fit a pose as one with another direction to the second camera."""

@@ -32,8 +32,8 @@ from spherloc.frontend.view import View
 from spherloc.images import check_image, read_size
 from spherloc.mapping.advice import advice, for_a_page
 from spherloc.mapping.frames import FRAMES, FrameChoice, frames_of
-from spherloc.mapping.gravity_check import check_stated
 from spherloc.mapping.given_cameras import given_cameras
+from spherloc.mapping.gravity_check import check_stated
 from spherloc.mapping.kept_scale import FILE as SCALE_FILE
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
 from spherloc.mapping.make import Map, MapRequest, ScaleMeasurement, make_map

@@ -365,7 +365,8 @@ def test_a_place_is_doubted_where_another_map_explains_more(tmp_path: Path, caps
         assert f"image1.png: {told[1]['remarks'][:-1]}" in said
         assert said.endswith(
             "3 of 3 queries are localized in one of these 2 maps\n"
-            f"  2 in {first / 'scene.toml'}: image0.png, image1.png\n  2 in {second / 'scene.toml'}: image0.png, image2.png\n"
+            f"  2 in {first / 'scene.toml'}: image0.png, image1.png\n"
+            f"  2 in {second / 'scene.toml'}: image0.png, image2.png\n"
         )
     write_scene(second, queries=3, wrong=[2])
     assert localize_in_maps({**solvings, second / "scene.toml": Solving("auto", (), tmp_path / "new", None)}) == 1
