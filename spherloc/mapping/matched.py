@@ -97,6 +97,12 @@ class Matched:
         left = {pair: one for pair, one in self.verified.items() if (names[pair[0]], names[pair[1]]) not in cut}
         return replace(self, verified=left, agreed=_agreeing(left))
 
+    def with_unsure(self) -> "Matched":
+        """The same with all pairs, sure or not."""
+        return replace(
+            self, verified={**self.unsure, **self.verified}, agreed=_agreeing({**self.unsure, **self.agreed})
+        )
+
     def matches(self) -> dict[Names, NDArray[np.int64]]:
         """(M, 2) indices of the features that match, right or wrong, of all pairs that were compared, by their
         names."""

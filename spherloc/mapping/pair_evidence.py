@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
+import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -111,6 +112,15 @@ class PairEvidence:
         points = np.array([made.model.point3D(point.point3D_id).xyz for point, _ in seen]).reshape(-1, 3)
         rays = self._bearings[second][[other for _, other in seen]]
         return distance_of(transform(made.poses[first], points), rays, pair.rotation, pair.direction)
+
+    def least_holding(self, poses: Mapping[str, FloatArray]) -> int:
+        """How many matches that fit the poses (3, 4) of a map hold its two parts together that fewest hold."""
+        graph = nx.Graph()
+        graph.add_nodes_from(poses)
+        for pair, count in self.between(poses, poses, poses).counts.items():
+            if count:
+                graph.add_edge(*pair, weight=count)
+        return int(nx.stoer_wagner(graph)[0]) if len(poses) > 1 and nx.is_connected(graph) else 0
 
     def between(self, poses: Mapping[str, FloatArray], some: Collection[str], others: Collection[str]) -> "Between":
         """How the matches between two sets of images fit their poses (3, 4)."""

@@ -47,6 +47,9 @@ STRONG = 0.3
 CUT_RAD = float(np.radians(15.0))
 """Largest angle between the rotation of a pair and that of its images in a map that was cut between them, if the pair
 says the same as that map: wrong pairs agree with each other less well than right ones."""
+WHOLE, HELD = 0.9, 250
+"""A map of all pairs is taken if it has the first share of the images, and none of its parts is held by fewer matches:
+in rendered flats those with images in the wrong room are held by 30 to 150, right ones of a square by 300 and more."""
 _TRIES = (
     {"init_min_num_inliers": 50, "init_min_tri_angle": 4.0},
     {"init_min_num_inliers": 25, "init_min_tri_angle": 2.0},
@@ -82,7 +85,8 @@ def reconstruct(
         counts = matched.counts()
         left = replace(left, same_place=with_ties(counts + matched.same_place, matched.names, shots) - counts)
     made, evidence = [rigid], PairEvidence(matched) if panoramas or not shots else None
-    for _ in range(ROUNDS):
+    held = _held(pycolmap, matched, evidence, tell) if evidence is not None and not panoramas else ()
+    for _ in range(0 if held else ROUNDS):
         cut = set[Names]()
         for keep in (0.0, STRONG):
             models, apart = _models_of(pycolmap, _UsedPairs(left, left.counts(), keep), tell, evidence)
@@ -91,7 +95,7 @@ def reconstruct(
         if not cut or evidence is None:
             break
         left = left.without(cut)
-    candidates = [models for models in made if models]
+    candidates = [models for models in (held, *made) if models]
     if rigid:
         candidates = [models for models in candidates if not any(went_apart(one.poses, shots) for one in models)]
     if not candidates:
@@ -103,6 +107,19 @@ def reconstruct(
     best = max(reversed(candidates), key=lambda models: (sum(map(worth, models)), worth(models[0])))
     found = best if evidence is None else joined_by_pairs(best, matched, evidence, tell)
     return tuple(replace(one, unsure=matched.none_sure) for one in found)
+
+
+def _held(pycolmap: Any, matched: Matched, evidence: PairEvidence, tell: Tell) -> tuple[Reconstruction, ...]:
+    """Models of all pairs, sure or not, if one has nearly all images and is well held together; else none.
+
+    Many pairs that are not sure, but agree, place images better than few that are.
+    """
+    every = matched.with_unsure()
+    models, _ = (
+        _models_of(pycolmap, _UsedPairs(every, every.counts()), tell, evidence) if matched.unsure else ((), None)
+    )
+    whole = models and len(models[0].poses) >= WHOLE * len(matched.ids)
+    return models if whole and evidence.least_holding(models[0].poses) >= HELD else ()
 
 
 def _rigid(

@@ -193,6 +193,20 @@ def test_images_are_misplaced_if_most_of_their_matches_fit_elsewhere(rooms):
     assert evidence.misplaced(wrong) == {("b0.png", "door.png")}, "the only pair between what was moved and the rest"
 
 
+def test_a_map_is_held_together_by_the_matches_of_its_weakest_part(rooms):
+    """The door alone, with 80 points of the one room that it shows the other."""
+    evidence = PairEvidence(rooms.matched())
+    held = evidence.least_holding(rooms.true)
+    assert held == min(
+        sum(evidence.between(rooms.true, part, rooms.true.keys() - part).counts.values())
+        for part in (
+            {name for name in rooms.true if name.startswith("b")},
+            {"door.png", *(n for n in rooms.true if n[0] == "b")},
+        )
+    )
+    assert evidence.least_holding({name: one for name, one in rooms.true.items() if name != "door.png"}) == 0
+
+
 def test_the_distance_is_that_on_which_points_agree(rng):
     turn, direction = so3_exp(np.array([0.1, -0.7, 0.2])), np.array([0.6, 0.0, 0.8])
     points = rng.normal(size=(60, 3)) * 4.0
