@@ -84,18 +84,10 @@ def reconstruct(
     if rigid:
         counts = matched.counts()
         left = replace(left, same_place=with_ties(counts + matched.same_place, matched.names, shots) - counts)
-    made, evidence = [rigid], PairEvidence(matched) if panoramas or not shots else None
+    evidence = PairEvidence(matched) if panoramas or not shots else None
     held = _held(pycolmap, matched, evidence, tell) if evidence is not None and not panoramas else ()
-    for _ in range(0 if held else ROUNDS):
-        cut = set[Names]()
-        for keep in (0.0, STRONG):
-            models, apart = _models_of(pycolmap, _UsedPairs(left, left.counts(), keep), tell, evidence)
-            made.append(models)
-            cut |= apart
-        if not cut or evidence is None:
-            break
-        left = left.without(cut)
-    candidates = [models for models in (held, *made) if models]
+    made = [held] if held else [rigid, *_of_sure_pairs(pycolmap, left, evidence, tell)]
+    candidates = [models for models in made if models]
     if rigid:
         candidates = [models for models in candidates if not any(went_apart(one.poses, shots) for one in models)]
     if not candidates:
@@ -107,6 +99,23 @@ def reconstruct(
     best = max(reversed(candidates), key=lambda models: (sum(map(worth, models)), worth(models[0])))
     found = best if evidence is None else joined_by_pairs(best, matched, evidence, tell)
     return tuple(replace(one, unsure=matched.none_sure) for one in found)
+
+
+def _of_sure_pairs(
+    pycolmap: Any, matched: Matched, evidence: PairEvidence | None, tell: Tell
+) -> list[tuple[Reconstruction, ...]]:
+    """Models of the pairs that are sure, and of the strong ones among them, each made again without what was cut."""
+    made = list[tuple[Reconstruction, ...]]()
+    for _ in range(ROUNDS):
+        cut = set[Names]()
+        for keep in (0.0, STRONG):
+            models, apart = _models_of(pycolmap, _UsedPairs(matched, matched.counts(), keep), tell, evidence)
+            made.append(models)
+            cut |= apart
+        if not cut or evidence is None:
+            break
+        matched = matched.without(cut)
+    return made
 
 
 def _held(pycolmap: Any, matched: Matched, evidence: PairEvidence, tell: Tell) -> tuple[Reconstruction, ...]:
