@@ -50,7 +50,7 @@ MANY_FIT_LEARNED = 250
 """The first of them where LightGlue matches, too, which finds many more on things that look alike."""
 SURE = 200.0
 """Of other images, which share a part of their view only, a pose is sure if so many matches fit it, times the cube of
-its peak: 60 matches with a peak of 1.5, or 25 with one of 2. ``benchmarks.headset --pairs`` shows why."""
+its peak: 60 matches with a peak of 1.5, or 25 with one of 2. ``benchmarks.headset`` shows pairs by that number."""
 MANY_SURE = 70
 """It is sure, too, if so many matches fit: on facades they fit many directions."""
 FAR = 1.0 / 3.0
