@@ -28,7 +28,9 @@ POLE_ROWS = HEIGHT_PX // 10
 LAG_PX = 8
 """Distance of the pixels of a row that are compared, so that noise counts less than what the row shows."""
 MAX_STEP, MAX_STEP_AND_POLES = 0.6, 0.75
-"""Limits for the median of images (``step_and_poles``): of the first number, and of both together."""
+"""Limits for the median of images (``ImageEdges``): of the step, and of step and poles together."""
+CLEAR_STEP, SHOWN = 0.2, 0.5
+"""Whatever lies at the poles, such as a caption, edges with no larger step are a panorama's, if they show as much."""
 
 
 def near_two_to_one(size: tuple[int, int], tolerance: float = STATED_RATIO) -> bool:
@@ -88,21 +90,31 @@ def are_full_panoramas(paths: Sequence[Path], *, unclear: bool = True) -> bool:
     looked_at = [paths[place] for place in np.linspace(0, len(paths) - 1, min(len(paths), MAX_LOOKED_AT)).astype(int)]
     if 2 * sum(says_full_panorama(path) for path in looked_at) > len(looked_at):
         return True
-    found = [told for path in looked_at if (told := step_and_poles(read_reduced(path, WIDTH_PX))) is not None]
+    found = [told for path in looked_at if (told := edges_of(read_reduced(path, WIDTH_PX))) is not None]
     if not found:
         return unclear
-    step, poles = np.median(found, axis=0)
-    return bool(step <= MAX_STEP and step + poles <= MAX_STEP_AND_POLES)
+    step, poles, shown = np.median([(one.step, one.poles, one.shown) for one in found], axis=0)
+    clear = step <= CLEAR_STEP and shown >= SHOWN
+    return bool(clear or (step <= MAX_STEP and step + poles <= MAX_STEP_AND_POLES))
 
 
-def step_and_poles(image: ByteArray) -> tuple[float, float] | None:
-    """How an image (H, W) or (H, W, 3) differs from a panorama, both from 0 to 1.
+@dataclass(frozen=True)
+class ImageEdges:
+    """How the edges of an image differ from those of a panorama."""
 
-    First the step between its right and left edges: 0 as between neighbouring columns, 1 as between distant ones.
-    Differences count from their median along the column, so that lenses of different brightness make no step. Second
-    how much its first or last row, whichever changes more, changes along it: a panorama's is a single direction; 1 as
-    other rows. None where columns tell nothing, since distant ones hardly differ more than neighbours.
-    """
+    step: float
+    """Between the right edge and the left one: 0 as between neighbouring columns, 1 as between distant ones.
+    Differences count from their median along the column, so that lenses of different brightness make no step."""
+    poles: float
+    """How much the first or the last row, whichever changes more, changes along it: a panorama's is a single direction;
+    1 as other rows."""
+    shown: float
+    """How much the left or the right edge, whichever changes less, changes along it; 1 as other columns."""
+
+
+def edges_of(image: ByteArray) -> ImageEdges | None:
+    """The edges of an image (H, W) or (H, W, 3); None where columns tell nothing, since distant ones hardly differ more
+    than neighbours."""
     small = cv2.resize(grey(image), (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_AREA).astype(float)
     between = small[POLE_ROWS:-POLE_ROWS]
 
@@ -118,7 +130,9 @@ def step_and_poles(image: ByteArray) -> tuple[float, float] | None:
     along = np.abs(small[:, LAG_PX:] - small[:, :-LAG_PX]).mean(axis=1)
     usual = max(0.5, float(np.median(along[POLE_ROWS:-POLE_ROWS])))
     step, poles = (float(seam) - near) / (far - near), max(along[0], along[-1]) / usual
-    return float(np.clip(step, 0.0, 1.0)), float(np.clip(poles, 0.0, 1.0))
+    down = np.abs(between[LAG_PX:] - between[:-LAG_PX]).mean(axis=0)
+    shown = min(down[0], down[-1]) / max(0.5, float(np.median(down)))
+    return ImageEdges(*(float(np.clip(one, 0.0, 1.0)) for one in (step, poles, shown)))
 
 
 def is_raw(path: Path, height: int) -> bool:

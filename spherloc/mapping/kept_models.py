@@ -87,7 +87,7 @@ def _write(folder: Path, key: str, made: Sequence[Reconstruction]) -> bool:
                 one.model.write(str(model))
                 np.savez(model / _COUNTS, matches=one.matches, all_matches=one.all_matches)
                 told = {"images": list(one.poses), "contradictions": one.contradictions}
-                index["models"].append({**told, "joined": one.joined, "joints": one.joints})
+                index["models"].append({**told, "joined": one.joined, "joints": one.joints, "unsure": one.unsure})
                 for name in names_in(model):
                     file.write(model / name, f"{number}/{name}")
             file.writestr(_INDEX, json.dumps(index))
@@ -132,4 +132,5 @@ def _one(pycolmap: Any, model: Path, told: dict[str, Any], database: Path, ids: 
         ids,
         told["joined"],
         tuple((one, other) for one, other in told["joints"]),
+        told["unsure"],
     )

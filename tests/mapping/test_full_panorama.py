@@ -54,10 +54,15 @@ def worn(image, how, rng):
         image = np.clip(image + rng.normal(0.0, 12.0, image.shape), 0, 255).astype(np.uint8)
     elif how == "night":
         image = image // 10
+    elif how == "caption":
+        image = image.copy()
+        image[-height // 12 :] = rng.integers(0, 2, (height, width))[-height // 12 :] * 255
     return image
 
 
-@pytest.mark.parametrize("how", ["", "black poles", "lenses of different brightness", "JPEG", "noise", "night"])
+@pytest.mark.parametrize(
+    "how", ["", "black poles", "lenses of different brightness", "JPEG", "noise", "night", "caption"]
+)
 def test_edges_tell_panoramas_from_crops(how, tmp_path, rng):
     for name in ("panoramas", "crops"):
         (tmp_path / name).mkdir()
