@@ -210,7 +210,7 @@ def test_arguments_that_do_not_go_together(tmp_path: Path) -> None:
         ({}, "no scene given"),
         ({"model": tmp_path}, "or with hloc's log"),
         ({"matches": matches}, "needs --camera"),
-        ({"gravity": gravity, "scene": bundled_scenes()[NAME]}, "does not go with scenes"),
+        ({"gravity": gravity, "scene": bundled_scenes()[NAME]}, "nor --gravity goes with scenes"),
         ({"matches": matches, "camera": camera, "map_down": (0.0, 0.0, 0.0)}, "has the length 0"),
     ):
         scenes = (given.pop("scene"),) if "scene" in given else ()

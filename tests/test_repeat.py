@@ -148,7 +148,7 @@ def test_the_command_ends_with_what_it_found(path: Path, capsys: pytest.CaptureF
     assert record["cam_from_map"] == record["recorded_cam_from_map"]
     assert [line.partition(": ")[2] for line in captured.err.splitlines()] == [
         f"{path.with_name('none.rrd')}: no such file; give the path of a recording (.rrd).",
-        f"{MEI}: not a whole recording (.rrd); give one that spherloc wrote.",
+        f"{MEI}: is a TOML file; open it with: spherloc play {MEI}",
     ]
     with pytest.raises(InputError, match="no recording given"):
         repeat_all([], as_json=False)

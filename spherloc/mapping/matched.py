@@ -153,7 +153,7 @@ def match_all(
     except OSError as error:
         raise StoppedError(f"{whole}: cannot be written ({reason(error)}); {advice('go on')}.") from None
     panoramas = all(isinstance(camera, Equirectangular) for camera in cameras)
-    none_sure = not panoramas and max(sureness.values(), default=SURE) < SURE
+    none_sure = not panoramas and all(one < SURE for one in sureness.values()) and bool(sureness)
     together = not panoramas and bool(shots_of(views))  # what cameras took together tells which pairs are wrong
     every = none_sure or together
     sure = {pair: one for pair, one in found.items() if every or sureness[pair] >= SURE}

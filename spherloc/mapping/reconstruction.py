@@ -123,12 +123,13 @@ def _held(pycolmap: Any, matched: Matched, evidence: PairEvidence, tell: Tell) -
 
     Many pairs that are not sure, but agree, place images better than few that are.
     """
+    if not matched.unsure:
+        return ()
     every = matched.with_unsure()
-    models, _ = (
-        _models_of(pycolmap, _UsedPairs(every, every.counts()), tell, evidence) if matched.unsure else ((), None)
-    )
-    whole = models and len(models[0].poses) >= WHOLE * len(matched.ids)
-    return models if whole and evidence.least_holding(models[0].poses) >= HELD else ()
+    models, _ = _models_of(pycolmap, _UsedPairs(every, every.counts()), tell, evidence)
+    if not models or len(models[0].poses) < WHOLE * len(matched.ids):
+        return ()
+    return models if evidence.least_holding(models[0].poses) >= HELD else ()
 
 
 def _rigid(
