@@ -117,8 +117,10 @@
     folded = pressTitle();
   }
 
+  // A window that has just become narrow still shows the panel of the wide one for a moment.
   function pressTitle() {
-    const title = [...document.querySelectorAll("div")].find((one) => !one.childElementCount && one.textContent === "spherloc");
+    const within = document.querySelector(SHEET)?.querySelectorAll("div") ?? [];
+    const title = [...within].find((one) => !one.childElementCount && one.textContent === "spherloc");
     title?.click();
     return title !== undefined;
   }
