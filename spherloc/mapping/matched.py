@@ -191,7 +191,7 @@ def _why_none(matched: Matched) -> str:
     why = f"the best pair has {matched.counts().max(initial=0)} matches that fit together, but {MIN_MATCHES} are needed"
     if matched.unsure:
         most = max(len(geometry.inlier_matches) for geometry in matched.unsure.values())
-        why = f"up to {most} matches of a pair fit together, but in one part of the view, as of a thing at two places"
+        why = f"up to {most} matches of a pair fit together, but as they may where things or places look alike"
     return (
         f"no two of the {count} photographs surely show the same place from two positions: {why}. Take them "
         "closer to each other, half a metre to two metres apart indoors."

@@ -39,7 +39,7 @@ ONE_PLACE_RAD = float(np.radians(0.5))
 LEVEL_BOUND_RAD = float(np.radians(1.2))
 """Largest angle of a match to its epipolar plane where gravity is used: it is known to a degree or less."""
 PEAK = 1.7
-"""Least peak (``ImagePairs.peak``) of a direction found through a third image."""
+"""Least peak (``ImagePairs.peak``) of a direction found through a third image, and of that between two panoramas."""
 LEAN_RAD = float(np.radians(1.5))
 """Angle by which the gravities of two images may differ under their relative pose, besides the bounds on gravity."""
 MANY_FIT, MIN_RATIO = 55, 1.0 / 3.0
@@ -48,6 +48,8 @@ one thing that stands at two places: so it is with all pairs whose pose is wrong
 with few of the others."""
 MANY_FIT_LEARNED = 250
 """The first of them where LightGlue matches, too, which finds many more on things that look alike."""
+MANY_FIT_PEAK = 140
+"""Two panoramas with fewer matches that fit, and a peak below ``PEAK``, may show two places that look alike."""
 SURE = 200.0
 """Of other images, which share a part of their view only, a pose is sure if so many matches fit it, times the cube of
 its peak: 60 matches with a peak of 1.5, or 25 with one of 2. ``benchmarks.headset`` shows pairs by that number."""
@@ -155,16 +157,18 @@ class ImagePairs:
     def sureness(self, first: int, second: int, pairs: NDArray[np.uint32], geometry: Any) -> float:
         """How sure a pose is; it should be ``SURE``.
 
-        Of panoramas 0 or infinity: whether what fits of the matches (M, 2) may be a thing that stands at two places. Of
-        others the number of those that fit, times the cube of the peak, or times what makes ``MANY_SURE`` sure.
+        Of panoramas 0 or infinity: whether what fits of the matches (M, 2) may be a thing that stands at two places, or
+        a place that looks alike. Of others the number of those that fit, times the cube of the peak, or times what
+        makes ``MANY_SURE`` sure.
         """
         rays, pose = self._rays(first, second, pairs), relative(geometry)
         fits = fitting(*rays, *pose, self.bound_rad)
-        cameras = self._cameras[first], self._cameras[second]
+        count, cameras = np.count_nonzero(fits), (self._cameras[first], self._cameras[second])
         if all(isinstance(camera, Equirectangular) for camera in cameras):
             many = MANY_FIT_LEARNED if self._learned(first, second) else MANY_FIT
-            return 0.0 if fit_on_one_thing(cameras, rays, fits, many) else np.inf
-        return np.count_nonzero(fits) * max(self.peak(first, second, pose) ** 3, SURE / MANY_SURE)
+            clear = count >= MANY_FIT_PEAK or self.peak(first, second, pose) >= PEAK
+            return 0.0 if fit_on_one_thing(cameras, rays, fits, many) or not clear else np.inf
+        return count * max(self.peak(first, second, pose) ** 3, SURE / MANY_SURE)
 
     def peak(self, first: int, second: int, pose: Relative) -> float:
         """How many times as many guided matches fit a pose as one with another direction to the second camera."""

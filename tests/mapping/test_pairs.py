@@ -108,15 +108,25 @@ def test_a_pose_of_drifting_clouds_is_none(rng):
     assert geometry is None
 
 
-@pytest.mark.parametrize(("right", "alike", "unsure"), [(45, 0, False), (45, 400, True), (150, 400, False)])
-def test_a_pose_of_fisheyes_is_sure_if_no_other_direction_has_nearly_as_many_matches(rng, right, alike, unsure):
+@pytest.mark.parametrize(
+    ("camera", "right", "alike", "unsure"),
+    [
+        (FISHEYE, 45, 0, False),
+        (FISHEYE, 45, 400, True),
+        (FISHEYE, 150, 400, False),
+        (CAMERA, 70, 0, False),
+        (CAMERA, 70, 400, True),
+        (CAMERA, 300, 400, False),
+    ],
+)
+def test_a_pose_is_sure_if_no_other_direction_has_nearly_as_many_matches(rng, camera, right, alike, unsure):
     """Floors and wallpaper, where each feature has many like it, match whatever the direction is."""
     count, second = right + alike, pose(yaw_rotation(0.3), [0.5, 0.0, 0.2])
     things = rng.uniform([-4.0, -3.0, 2.0], [4.0, 3.0, 6.0], (count, 3))
     there = np.concatenate([transform(second, things[:right]), rng.uniform([-4, -3, 2], [4, 3, 6], (alike, 3))])
     words = rng.normal(size=(count, 128)).astype(np.float32)
     words[right:] = rng.normal(size=128) + 0.2 * rng.normal(size=(alike, 128))
-    pair = two_images(rng, things, there, words=words, camera=FISHEYE)
+    pair = two_images(rng, things, there, words=words, camera=camera)
     geometry = pair._estimated(0, 1, np.tile(np.arange(right, dtype=np.uint32)[:, None], 2))
     matches = np.tile(np.arange(count, dtype=np.uint32)[:, None], 2)
     assert rotation_angle(relative(geometry)[0] @ second[:, :3].T) < np.radians(0.2)
