@@ -19,6 +19,10 @@ MAX_PIXELS = 150_000_000
 """Largest number of pixels, beyond any panorama, so that a corrupt header cannot exhaust the memory."""
 
 
+class DamagedImageError(InputError):
+    """A file that can be read holds no image, or not all of one."""
+
+
 def read_image(path: Path) -> ByteArray:
     """An image as (H, W, 3) BGR or (H, W) grey bytes.
 
@@ -54,7 +58,8 @@ def read_size(path: Path) -> tuple[int, int]:
 def check_image(path: Path) -> tuple[int, int]:
     """Width and height of an image, px, after all of it was decoded: JPEGs in a tenth of the usual time.
 
-    Raises ``InputError`` as ``read_image`` does; ``read_size`` does not notice that the end of a file is missing.
+    Raises ``InputError`` as ``read_image`` does, ``DamagedImageError`` if the file itself is at fault; ``read_size``
+    does not notice that its end is missing.
     """
     size = read_size(path)
     read_eighth(path)
@@ -99,7 +104,7 @@ def _decode(path: Path, flags: int) -> NDArray:
     except cv2.error:
         image = None
     if image is None or image.size == 0:
-        raise InputError(f"{path}: not an image that can be read, or a damaged one; replace it.")
+        raise DamagedImageError(f"{path}: not an image that can be read, or a damaged one; replace it.")
     return image
 
 
@@ -111,7 +116,7 @@ def _size(file: BinaryIO, path: Path) -> tuple[int, int]:
     except Image.DecompressionBombError:  # Pillow's own limit is a little higher than ours
         width, height = MAX_PIXELS, MAX_PIXELS
     except Exception:  # Pillow's readers pass on whatever a damaged header raises
-        raise InputError(f"{path}: not an image that can be read, or a damaged one; replace it.") from None
+        raise DamagedImageError(f"{path}: not an image that can be read, or a damaged one; replace it.") from None
     if not 0 < width * height <= MAX_PIXELS:
         raise InputError(f"{path}: claims 0 pixels or more than {MAX_PIXELS:,}; give a smaller image.")
     return width, height

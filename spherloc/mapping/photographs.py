@@ -16,7 +16,7 @@ from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
-from spherloc.images import check_image
+from spherloc.images import DamagedImageError, check_image
 from spherloc.mapping.advice import advice
 from spherloc.mapping.frames import MAX_IMAGES, FrameChoice, ImageFolder, chosen
 from spherloc.mapping.full_panorama import full_panoramas, near_two_to_one
@@ -26,6 +26,8 @@ from spherloc.trajectory import NS_PER_S
 MIN_IMAGES = 2
 UNREAD = {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gpr", ".heic", ".heif", ".insp", ".nef", ".orf", ".raf", ".rw2"}
 """Endings of photographs that OpenCV does not read."""
+TIFF = {".tif", ".tiff"}
+"""Endings of images whose pixels may be of a kind that OpenCV does not read, such as floating-point numbers."""
 MAX_NAMED = 3
 """Largest number of names in a remark."""
 CALIBRATIONS = (".yaml", ".yml", ".json", ".toml", ".txt", ".xml")
@@ -227,16 +229,18 @@ def _of_folder(
     """
     folder = root / place.inside
     sizes: dict[tuple[int, int], list[str]] = {}
-    damaged, others = [], []
+    damaged, refused, others = [], [], []
     for name in place.names:
         if not is_image(name):
             others.append(name)
             continue
         try:
             sizes.setdefault(check_image(folder / name), []).append(name)
-        except InputError:
+        except DamagedImageError:
             damaged.append(name)
-    remarks = [*_about_damaged(damaged), *_about_unread(others)]
+        except InputError as error:
+            refused.append(str(error))
+    remarks = [*_about_damaged(damaged), *_about_refused(refused), *_about_unread(others)]
     if not sizes:
         raise InputError(_without_photographs(folder, remarks, of_map is not None))
     cameras = given or {
@@ -423,9 +427,24 @@ def _of_files(files: Sequence[Path], least: int = 1) -> FoundCalibrations:
 
 
 def _about_damaged(names: Sequence[str]) -> list[str]:
-    if not names:
+    tiffs = [name for name in names if Path(name).suffix.lower() in TIFF]
+    rest = [name for name in names if name not in tiffs]
+    remarks = []
+    if rest:
+        left = f"{_were(len(rest), 'image')} left out, damaged or empty: {_some(rest)}"
+        remarks.append(f"{left}; copy again what is needed.")
+    if tiffs:
+        left = f"{_were(len(tiffs), 'image')} left out, damaged or with pixels of more than 16 bits: {_some(tiffs)}"
+        remarks.append(f"{left}; save them as JPEG or PNG.")
+    return remarks
+
+
+def _about_refused(errors: Sequence[str]) -> list[str]:
+    """A remark on sound images that are too large, or may not be read, by the sentences on each of them."""
+    if not errors:
         return []
-    return [f"{_were(len(names), 'image')} left out, damaged or empty: {_some(names)}; copy again what is needed."]
+    first = "" if len(errors) == 1 else " The first:"
+    return [f"{_were(len(errors), 'image')} left out that cannot be read.{first} {errors[0]}"]
 
 
 def _about_raw(names: Sequence[str]) -> list[str]:

@@ -648,6 +648,19 @@ def test_nothing_in_a_folder_of_a_stranger_is_left_out_in_silence(tmp_path, rng)
     assert "cut.jpg" in found.remarks[0] and "convert .heic" in found.remarks[1] and "inside" in found.remarks[2]
 
 
+def test_a_sound_image_is_not_said_to_be_damaged(tmp_path, rng, monkeypatch):
+    for name in ("a.png", "b.png"):
+        picture(tmp_path / name, 400, 200, rng)
+    monkeypatch.setattr("spherloc.images.MAX_PIXELS", 100_000)
+    picture(tmp_path / "large.png", 800, 400, rng)
+    assert cv2.imwrite(str(tmp_path / "depth.tif"), rng.random((200, 400)).astype(np.float32))
+    found = photographs(tmp_path, {})
+    assert [view.name for view in found.views] == ["a.png", "b.png"]
+    tiff, large = found.remarks
+    assert tiff.startswith("1 image was left out, damaged or with pixels of more than 16 bits: depth.tif; save")
+    assert "large.png: claims" in large and "100,000; give a smaller image" in large and "damaged" not in large
+
+
 def test_raw_images_of_a_360_degree_camera_are_no_panoramas(tmp_path, rng):
     """Nor are panoramas raw whose zenith and nadir are black, or that were taken at night."""
     v, u = np.mgrid[:200, :400]
@@ -961,7 +974,7 @@ def test_new_images_are_counted_by_their_size(tmp_path, rng):
         picture(new / name, *size, rng)
     (new / "d.jpg").write_text("no image")
     (empty / "notes.txt").write_text("nothing")
-    assert _sizes(NewImages(new, None)) == "2 of 400 x 200 pixels, 1 of 300 x 200 pixels, 1 damaged"
+    assert _sizes(NewImages(new, None)) == "2 of 400 x 200 pixels, 1 of 300 x 200 pixels, 1 that cannot be read"
     mapped = Photographs(tuple(view for view in photographs(new, {}).views if view.camera.width == 400), (), {})
     found, remarks = new_images_of(new, mapped)
     assert found == NewImages(new, None), "all that can be are of the map's camera"
