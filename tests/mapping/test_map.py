@@ -386,6 +386,19 @@ def test_a_distance_to_an_image_that_is_not_in_the_map_leaves_the_units_unknown(
     assert nearest < 10.0 < farthest < 20.0  # units
 
 
+def test_a_scale_that_was_given_in_millimetres_is_doubted(walk):
+    pycolmap = registry.require("pycolmap", "colmap", "making a map")
+    _, found, made, *_ = walk
+    for larger, doubted in ((1.0, False), (1000.0, True), (0.001, True)):
+        model = copy.deepcopy(made.made.model)
+        model.transform(pycolmap.Sim3d(larger, pycolmap.Rotation3d(), np.zeros(3)))
+        given = replace(made, made=replace(made.made, model=model))
+        said = [line for line in summary(given, found) if "whether the scale was given in metres" in line]
+        assert bool(said) == doubted == ("whether the scale was given in metres" in map_report(given, found))
+        unknown = replace(given, scale=replace(made.scale, source=""))
+        assert not any("given in metres" in line for line in summary(unknown, found))
+
+
 def test_the_calibration_beside_the_photographs_is_taken(tmp_path, rng):
     for name in ("a.png", "b.png"):
         picture(tmp_path / name, 400, 300, rng)
