@@ -1002,6 +1002,8 @@ def test_new_images_are_counted_by_their_size(tmp_path, rng):
         new_images_of(new, mapped)
     with pytest.raises(InputError, match="empty: has no images; give a folder with images that are to be localized"):
         new_images_of(empty, mapped)
+    with pytest.raises(InputError, match=r"c\.png: is an image; give a folder with it and others that are to be local"):
+        new_images_of(new / "c.png", mapped)
 
 
 def test_scenes_of_the_map_before_are_told(walk):
