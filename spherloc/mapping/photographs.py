@@ -26,8 +26,6 @@ from spherloc.trajectory import NS_PER_S
 MIN_IMAGES = 2
 UNREAD = {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gpr", ".heic", ".heif", ".insp", ".nef", ".orf", ".raf", ".rw2"}
 """Endings of photographs that OpenCV does not read."""
-TIFF = {".tif", ".tiff"}
-"""Endings of images whose pixels may be of a kind that OpenCV does not read, such as floating-point numbers."""
 MAX_NAMED = 3
 """Largest number of names in a remark."""
 CALIBRATIONS = (".yaml", ".yml", ".json", ".toml", ".txt", ".xml")
@@ -427,20 +425,13 @@ def _of_files(files: Sequence[Path], least: int = 1) -> FoundCalibrations:
 
 
 def _about_damaged(names: Sequence[str]) -> list[str]:
-    tiffs = [name for name in names if Path(name).suffix.lower() in TIFF]
-    rest = [name for name in names if name not in tiffs]
-    remarks = []
-    if rest:
-        left = f"{_were(len(rest), 'image')} left out, damaged or empty: {_some(rest)}"
-        remarks.append(f"{left}; copy again what is needed.")
-    if tiffs:
-        left = f"{_were(len(tiffs), 'image')} left out, damaged or with pixels of more than 16 bits: {_some(tiffs)}"
-        remarks.append(f"{left}; save them as JPEG or PNG.")
-    return remarks
+    if not names:
+        return []
+    return [f"{_were(len(names), 'image')} left out, damaged or empty: {_some(names)}; copy again what is needed."]
 
 
 def _about_refused(errors: Sequence[str]) -> list[str]:
-    """A remark on sound images that are too large, or may not be read, by the sentences on each of them."""
+    """A remark on images that are too large, hold other numbers or may not be read, by the sentences on each."""
     if not errors:
         return []
     first = "" if len(errors) == 1 else " The first:"

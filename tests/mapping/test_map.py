@@ -669,9 +669,12 @@ def test_a_sound_image_is_not_said_to_be_damaged(tmp_path, rng, monkeypatch):
     assert cv2.imwrite(str(tmp_path / "depth.tif"), rng.random((200, 400)).astype(np.float32))
     found = photographs(tmp_path, {})
     assert [view.name for view in found.views] == ["a.png", "b.png"]
-    tiff, large = found.remarks
-    assert tiff.startswith("1 image was left out, damaged or with pixels of more than 16 bits: depth.tif; save")
-    assert "large.png: claims" in large and "100,000; give a smaller image" in large and "damaged" not in large
+    (said,) = found.remarks
+    assert said.startswith("2 images were left out that cannot be read. The first: ")
+    assert "depth.tif: has float32 pixels; give an image with 8 or 16 bits" in said
+    (tmp_path / "depth.tif").unlink()
+    (said,) = photographs(tmp_path, {}).remarks
+    assert "large.png: claims" in said and "100,000; give a smaller image" in said
 
 
 def test_raw_images_of_a_360_degree_camera_are_no_panoramas(tmp_path, rng):
