@@ -1018,6 +1018,10 @@ def test_scenes_of_the_map_before_are_told(walk):
         assert _of_the_map_before(folder, made) == []
         other.write_text(text.replace("points. Units are", "points, as yesterday. Units are"))
         assert _of_the_map_before(folder, made) == ["other.toml"]
+        assert load_scene(other).metric
+        other.write_text(text.replace('units = "metres"', 'units = "unknown"'))
+        with pytest.raises(InputError, match=r"units is 'unknown', but scene\.toml beside it has 'metres' for the"):
+            load_scene(other)
     finally:
         other.unlink()
 
