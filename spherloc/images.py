@@ -1,4 +1,7 @@
-"""Reads images. Pixels are used as they are stored: a calibration does not consider a photograph's orientation tag."""
+"""Reads images. Pixels are used as they are stored: a calibration does not consider a photograph's orientation tag.
+
+Those of 16 bits become 8 by the bits that the image uses: cameras with 10 or 12 bits fill the lower ones.
+"""
 
 import io
 import warnings
@@ -18,16 +21,21 @@ MAX_BYTES = 200_000_000
 MAX_PIXELS = 150_000_000
 """Largest number of pixels, beyond any panorama, so that a corrupt header cannot exhaust the memory."""
 
+USED_BITS = (8, 10, 12, 16)
+"""How many bits of 16 cameras use. Of 16 bits that stop below 12 hardly anything could be seen."""
+
+
+class DamagedImageError(InputError):
+    """A file that can be read holds no image, or not all of one."""
+
 
 def read_image(path: Path) -> ByteArray:
     """An image as (H, W, 3) BGR or (H, W) grey bytes.
 
-    Raises ``InputError`` for a file that is missing, unreadable, too large or not an image.
+    Raises ``InputError`` for a file that is missing, unreadable, too large, not an image or one of other numbers than
+    integers of 8 or 16 bits.
     """
-    image = _decode(path, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image.dtype != np.uint8 or image.ndim not in (2, 3):
-        raise InputError(f"{path}: has {image.dtype} pixels; give an image with 8 bits a channel.")
-    return image
+    return _read(path, cv2.IMREAD_ANYCOLOR)
 
 
 def read_depth_png(path: Path) -> NDArray[np.uint16]:
@@ -54,7 +62,8 @@ def read_size(path: Path) -> tuple[int, int]:
 def check_image(path: Path) -> tuple[int, int]:
     """Width and height of an image, px, after all of it was decoded: JPEGs in a tenth of the usual time.
 
-    Raises ``InputError`` as ``read_image`` does; ``read_size`` does not notice that the end of a file is missing.
+    Raises ``InputError`` as ``read_image`` does, ``DamagedImageError`` if the file itself is at fault; ``read_size``
+    does not notice that its end is missing.
     """
     size = read_size(path)
     read_eighth(path)
@@ -66,7 +75,7 @@ def read_eighth(path: Path) -> ByteArray:
 
     Raises ``InputError`` as ``read_image`` does.
     """
-    return _decode(path, cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION)
+    return _read(path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
 
 
 def read_reduced(path: Path, least_px: int) -> ByteArray:
@@ -81,12 +90,22 @@ def read_reduced(path: Path, least_px: int) -> ByteArray:
         (2, cv2.IMREAD_REDUCED_GRAYSCALE_2),
     )
     flag = next((flag for divisor, flag in flags if longer >= divisor * least_px), cv2.IMREAD_GRAYSCALE)
-    return _decode(path, flag | cv2.IMREAD_IGNORE_ORIENTATION)
+    return _read(path, flag)
 
 
 def grey(image: ByteArray) -> ByteArray:
     """Grey image (H, W) of a BGR or grey image."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def _read(path: Path, flag: int) -> ByteArray:
+    image = _decode(path, flag | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image.dtype == np.uint16:
+        most = int(image.max())
+        image = (image >> next(bits - 8 for bits in USED_BITS if most < 1 << bits)).astype(np.uint8)
+    if image.dtype != np.uint8 or image.ndim not in (2, 3):
+        raise InputError(f"{path}: has {image.dtype} pixels; give an image with 8 or 16 bits a channel.")
+    return image
 
 
 def _decode(path: Path, flags: int) -> NDArray:
@@ -99,7 +118,7 @@ def _decode(path: Path, flags: int) -> NDArray:
     except cv2.error:
         image = None
     if image is None or image.size == 0:
-        raise InputError(f"{path}: not an image that can be read, or a damaged one; replace it.")
+        raise DamagedImageError(f"{path}: not an image that can be read, or a damaged one; replace it.")
     return image
 
 
@@ -111,7 +130,9 @@ def _size(file: BinaryIO, path: Path) -> tuple[int, int]:
     except Image.DecompressionBombError:  # Pillow's own limit is a little higher than ours
         width, height = MAX_PIXELS, MAX_PIXELS
     except Exception:  # Pillow's readers pass on whatever a damaged header raises
-        raise InputError(f"{path}: not an image that can be read, or a damaged one; replace it.") from None
+        if path.suffix.lower() in (".tif", ".tiff"):  # Pillow lacks kinds such as colours in floating-point numbers
+            raise InputError(f"{path}: is damaged, or a TIFF of a kind that is not read; save it as PNG.") from None
+        raise DamagedImageError(f"{path}: not an image that can be read, or a damaged one; replace it.") from None
     if not 0 < width * height <= MAX_PIXELS:
         raise InputError(f"{path}: claims 0 pixels or more than {MAX_PIXELS:,}; give a smaller image.")
     return width, height

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from spherloc.errors import InputError
-from spherloc.images import grey, read_depth_png, read_image, read_size
+from spherloc.images import grey, read_depth_png, read_eighth, read_image, read_size
 
 PICTURE = np.random.default_rng(5).integers(0, 256, (24, 40, 3), dtype=np.uint8)
 DEPTH = np.random.default_rng(6).integers(0, 65536, (24, 40), dtype=np.uint16)
@@ -47,6 +47,29 @@ def test_an_orientation_tag_turns_nothing(tmp_path: Path) -> None:
     tag[0x0112] = 6  # to be shown turned by 90 degrees
     Image.fromarray(PICTURE[:, :, ::-1]).save(tmp_path / "a.jpg", exif=tag, quality=95)
     assert read_image(tmp_path / "a.jpg").shape == PICTURE.shape and read_size(tmp_path / "a.jpg") == (40, 24)
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
+@pytest.mark.parametrize("suffix", [".png", ".tiff"])
+def test_16_bits_become_8_by_those_that_are_used(tmp_path: Path, bits: int, suffix: str) -> None:
+    """A camera of 12 bits fills the lower ones, which would else be nearly black."""
+    path = tmp_path / f"a{suffix}"
+    for picture in (PICTURE, PICTURE[:, :, 0]):
+        cv2.imwrite(str(path), picture.astype(np.uint16) << (bits - 8))
+        assert np.array_equal(read_image(path), picture)
+        assert abs(read_eighth(path).mean() - picture.mean()) < 30.0
+    cv2.imwrite(str(path), np.zeros((24, 40), np.uint16))
+    assert not read_image(path).any()
+
+
+def test_numbers_that_are_no_pixels_are_told(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.tiff"), PICTURE[:, :, 0].astype(np.float32))
+    for read in (read_image, read_eighth):
+        with pytest.raises(InputError, match=r"a\.tiff: has float32 pixels; give an image with 8 or 16 bits a channel"):
+            read(tmp_path / "a.tiff")
+    cv2.imwrite(str(tmp_path / "a.tiff"), PICTURE.astype(np.float32))
+    with pytest.raises(InputError, match=r"a\.tiff: is damaged, or a TIFF of a kind that is not read; save it as PNG"):
+        read_image(tmp_path / "a.tiff")
 
 
 def test_depth_has_16_bits(tmp_path: Path) -> None:

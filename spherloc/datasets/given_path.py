@@ -16,6 +16,8 @@ ARCHIVES = {".7z", ".bz2", ".gz", ".rar", ".tar", ".tgz", ".xz", ".zip"}
 VIDEOS = {".360", ".avi", ".insv", ".m4v", ".mkv", ".mov", ".mp4", ".webm"}
 PICKLES = {".pickle", ".pkl"}
 SCENE = "give the path of a scene file (TOML) or a bundled scene's name, which spherloc scenes lists"
+OF_MAP = "scene.toml"
+"""The scene file of a map of photographs itself, in the folder of that map."""
 COMMAND = re.compile(r": spherloc [^;]*$")
 """A command at the end of a sentence."""
 MAX_SCENE_BYTES = 1_000_000
@@ -125,7 +127,8 @@ def _folder(path: Path) -> tuple[str, str]:
         return what, f"make a map of them with: spherloc map {_quoted(path)}"
     scenes = [name for name in names if name.endswith(".toml") and _may_be_scene(path / name)]
     if scenes:
-        return _counted(len(scenes), "scene file"), f"give one of them, such as {shorten(str(path / scenes[0]))}"
+        first = OF_MAP if OF_MAP in scenes else scenes[0]
+        return _counted(len(scenes), "scene file"), f"give one of them, such as {shorten(str(path / first))}"
     videos = [name for name in names if Path(name).suffix.lower() in VIDEOS]
     if videos:
         video = _quoted(path / videos[0])
@@ -139,12 +142,13 @@ def _folder(path: Path) -> tuple[str, str]:
 
 
 def _may_be_scene(path: Path) -> bool:
-    """Whether a TOML file has a kind or a camera, as scene files do, or cannot be read, so that its loader says why."""
+    """Whether a TOML file has more than a camera, which a calibration has alone, and a kind or a camera, as scene files
+    do, or cannot be read, so that its loader says why."""
     try:
         table = tomllib.loads(read_file(path, MAX_SCENE_BYTES).decode())
     except (InputError, OSError, ValueError):
         return True
-    return not table or bool(table.keys() & {"kind", "camera"})
+    return not table or bool(table.keys() & {"kind", "camera"} and table.keys() != {"camera"})
 
 
 def _images(names: Sequence[str]) -> int:

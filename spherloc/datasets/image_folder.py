@@ -24,6 +24,7 @@ from spherloc.datasets.colmap import (
     split_gravity,
     unit_vector,
 )
+from spherloc.datasets.given_path import OF_MAP
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, shorten, show
 from spherloc.files import IMAGES, is_file, is_image, names_in, size_of
@@ -252,7 +253,8 @@ class _Cameras:
 def load(table: dict[str, Any], path: Path) -> MapScene:
     """Read a scene of ``kind = "image-folder"``; paths in it are relative to its file.
 
-    Raises ``InputError`` for a wrong key or value, a missing file, or a map that cannot be read.
+    Raises ``InputError`` for a wrong key or value, a missing file, a map that cannot be read, or one that has got other
+    units since.
     """
     where = str(path)
     scene_file.check_keys(table, map_scene.REQUIRED | {"images"}, map_scene.OPTIONAL | _OPTIONAL, where)
@@ -262,6 +264,7 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
         raise InputError(f"{where} [gravity]: has both 'camera' and '{other}'; keep one.")
     bound_deg = 0.0 if "camera" in gravity else GRAVITY_BOUND_DEG
     settings = map_scene.read_settings(table | {"gravity": shared_gravity}, where, bound_deg)
+    _check_units(table, path)
     cameras = _cameras(table, path)
     queries, remarks = _queries(table, cameras, gravity, path)
     references, more, cloud = _references(table, cameras.shared, settings.frontend, path)
@@ -279,6 +282,27 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
         cloud=cloud,
         truth_source=truth_source,
     )
+
+
+def _check_units(table: Mapping[str, Any], path: Path) -> None:
+    """Raise ``InputError`` if the scene of a map of photographs, which is written with every map, says of the same
+    model that its lengths have other units: then this scene was written for an earlier map."""
+    of_map = path.with_name(OF_MAP)
+    if path.name == OF_MAP or "map" not in table or not is_file(of_map):
+        return
+    try:
+        other = scene_file.read_table(of_map)
+    except InputError:  # its own loader says why
+        return
+    # That scene is of kind "colmap", or of this one where the map has few images.
+    model = other["map"].get("model") if isinstance(other.get("map"), dict) else other.get("model")
+    same = model is not None and isinstance(table["map"], dict) and model == table["map"].get("model")
+    units, now = (one.get("units", "metres") for one in (table, other))
+    if same and units != now:
+        raise InputError(
+            f"{path}: units is {show(units)}, but {OF_MAP} beside it has {show(now)} for the same model, which was "
+            "made again since; localize these images again with spherloc map."
+        )
 
 
 def _cameras(table: dict[str, Any], path: Path) -> _Cameras:

@@ -23,7 +23,7 @@ from spherloc.frontend.view import View
 from spherloc.images import MAX_BYTES
 from spherloc.types import BoolArray, ByteArray, FloatArray
 
-VERSION = 4
+VERSION = 5
 """Number to be increased when the same options give other features, so that old files are not used."""
 
 

@@ -8,7 +8,7 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.given_path import known_as
 from spherloc.errors import InputError
-from spherloc.files import is_folder, is_image, names_in
+from spherloc.files import is_file, is_folder, is_image, names_in
 from spherloc.frontend.view import Gravity, View
 from spherloc.images import read_size
 from spherloc.mapping.frames import FrameChoice
@@ -49,6 +49,8 @@ def new_images_of(
     are panoramas. Raises ``InputError`` if there is no image, or none whose camera is known.
     """
     if not is_folder(folder):
+        if is_file(folder) and is_image(folder.name):
+            raise InputError(f"{folder}: is an image; give a folder with it and others that are to be localized.")
         raise InputError(
             known_as(folder) or f"{folder}: is not a folder; give one with images that are to be localized."
         )

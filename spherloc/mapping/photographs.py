@@ -16,7 +16,7 @@ from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
-from spherloc.images import check_image
+from spherloc.images import DamagedImageError, check_image
 from spherloc.mapping.advice import advice
 from spherloc.mapping.frames import MAX_IMAGES, FrameChoice, ImageFolder, chosen
 from spherloc.mapping.full_panorama import full_panoramas, near_two_to_one
@@ -227,16 +227,18 @@ def _of_folder(
     """
     folder = root / place.inside
     sizes: dict[tuple[int, int], list[str]] = {}
-    damaged, others = [], []
+    damaged, refused, others = [], [], []
     for name in place.names:
         if not is_image(name):
             others.append(name)
             continue
         try:
             sizes.setdefault(check_image(folder / name), []).append(name)
-        except InputError:
+        except DamagedImageError:
             damaged.append(name)
-    remarks = [*_about_damaged(damaged), *_about_unread(others)]
+        except InputError as error:
+            refused.append(str(error))
+    remarks = [*_about_damaged(damaged), *_about_refused(refused), *_about_unread(others)]
     if not sizes:
         raise InputError(_without_photographs(folder, remarks, of_map is not None))
     cameras = given or {
@@ -426,6 +428,14 @@ def _about_damaged(names: Sequence[str]) -> list[str]:
     if not names:
         return []
     return [f"{_were(len(names), 'image')} left out, damaged or empty: {_some(names)}; copy again what is needed."]
+
+
+def _about_refused(errors: Sequence[str]) -> list[str]:
+    """A remark on images that are too large, hold other numbers or may not be read, by the sentences on each."""
+    if not errors:
+        return []
+    first = "" if len(errors) == 1 else " The first:"
+    return [f"{_were(len(errors), 'image')} left out that cannot be read.{first} {errors[0]}"]
 
 
 def _about_raw(names: Sequence[str]) -> list[str]:

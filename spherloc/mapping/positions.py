@@ -6,6 +6,7 @@ similarity has the least median of distances (Rousseeuw 1984) and is then fitted
 
 import csv
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from PIL import Image
 from spherloc.datasets.imu import NAME_RULE
 from spherloc.datasets.query_gravity import time_of
 from spherloc.errors import InputError, shorten, show
-from spherloc.files import open_file, reading
+from spherloc.files import open_file
 from spherloc.formats.text_rows import finite_numbers, rows
 from spherloc.frontend.view import View
 from spherloc.trajectory import Trajectory, pose_at, read_euroc, read_tum
@@ -234,7 +235,8 @@ def gps_of_images(views: Sequence[View]) -> Positions | None:
 def _gps_tag(path: Path) -> tuple[float, float] | None:
     """Latitude and longitude, degrees, that a camera wrote into an image; None if there is nothing usable."""
     try:
-        with reading(path, "correct the path of the image"), open_file(path) as file, Image.open(file) as image:
+        # Pillow warns of images that are large, as panoramas are.
+        with warnings.catch_warnings(action="ignore"), open_file(path) as file, Image.open(file) as image:
             tags = image.getexif().get_ifd(_GPS_TAGS)
             signs = [tags[1] in ("N", "n"), tags[3] in ("E", "e")]
             angles = [sum(float(part) / 60**power for power, part in enumerate(tags[tag])) for tag in (2, 4)]

@@ -246,7 +246,7 @@ def _unwritten(report: Path, error: OSError) -> str:
 
 
 def _sizes(images: NewImages) -> str:
-    """How many new images of which size there are, the most frequent first; a damaged one counts apart."""
+    """How many new images of which size there are, the most frequent first; unreadable ones count apart."""
     sizes: Counter[str] = Counter()
     known = None if images.views is None else [view.name for view in images.views]
     for name in filter(is_image, names_in(images.folder)) if known is None else known:
@@ -254,7 +254,7 @@ def _sizes(images: NewImages) -> str:
             width, height = read_size(images.folder / name)
             sizes[f"of {width} x {height} pixels"] += 1
         except InputError:
-            sizes["damaged"] += 1
+            sizes["that cannot be read"] += 1
     return ", ".join(f"{count} {size}" for size, count in sizes.most_common(MAX_SIZES))
 
 

@@ -30,6 +30,9 @@ UP = np.array([0.0, 0.0, 1.0])
 """In every map that is written."""
 MOST_ABOVE = 0.65
 """If more of the points are above the cameras, stated gravity may point up."""
+USUAL_M = (0.05, 200.0)
+"""Metres from images to the points that they see, in the median, between which the scale of a map is believed: from a
+camera on a table to one in the air. Millimetres and mostly centimetres that were given for metres are beyond."""
 _UNSURE = "hardly more matches fit the poses of two images than other poses; images closer to each other are surer"
 
 
@@ -47,6 +50,8 @@ def summary(made: Map, found: Photographs) -> list[str]:
         f"features      {about_features(made)}",
         f"scale         {made.scale.source or _units_unknown(made)}",
     ]
+    if said := _scale_words(made):
+        lines.append(f"in doubt      {said}")
     if made.lines.unsure:
         lines.append(
             "in doubt      whether down is right: by their lines, most images lean by more than "
@@ -107,6 +112,18 @@ def about_features(made: Map) -> str:
         return MAP_FEATURES[made.features]
     more = advice("more features")
     return f"SIFT{more}" if trained.installed() or not more else f"SIFT{more}, with the extra 'learned'"
+
+
+def _scale_words(made: Map) -> str:
+    """Why the scale may have been given in another unit than metres; empty if nothing speaks for that."""
+    depths = made.made.depths()  # the model has the scale since it was written
+    usual_m = float(np.median(depths)) if len(depths) else USUAL_M[0]
+    if not made.scale.source or USUAL_M[0] <= usual_m <= USUAL_M[1]:
+        return ""
+    usual = f"{usual_m:,.0f}" if usual_m > 1.0 else f"{usual_m:.2g}"
+    return (
+        f"whether the scale was given in metres: points of the map are {usual} m from the images that see them (median)"
+    )
 
 
 def _units_unknown(made: Map) -> str:
@@ -210,6 +227,8 @@ def map_report(made: Map, found: Photographs) -> str:
 def _doubts(made: Map) -> list[str]:
     against, far = made.made.contradictions, made.scale.misplaced
     said = [f'<p class="out">Images {html.escape(_far_words(far))}.</p>'] if far else []
+    if words := _scale_words(made):
+        said.append(f'<p class="out">In doubt: {html.escape(words)}.</p>')
     said += [f'<p class="out">In doubt: {html.escape(doubt)}</p>' for doubt in made.doubts]
     if made.opposed:
         said.append(f'<p class="out">In doubt: {html.escape(_opposed_words(*made.opposed))}.</p>')

@@ -85,6 +85,15 @@ def test_other_files_that_end_like_scene_files_are_none(tmp_path):
     assert "is a folder of 1 scene file; give one of them" in told and "mine.toml" in told
 
 
+def test_the_scene_of_a_map_is_named_and_not_its_lens(tmp_path):
+    """A map's folder has its lens and scenes of other photographs, too."""
+    (tmp_path / "lens.toml").write_text('[camera]\nmodel = "equirectangular"\nwidth = 800\nheight = 400\n')
+    for name in ("more.toml", "scene.toml"):
+        (tmp_path / name).write_text('kind = "image-folder"\n')
+    told = what_it_is(tmp_path)
+    assert "is a folder of 2 scene files; give one of them" in told and told.endswith("scene.toml.")
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [

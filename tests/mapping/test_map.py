@@ -386,6 +386,19 @@ def test_a_distance_to_an_image_that_is_not_in_the_map_leaves_the_units_unknown(
     assert nearest < 10.0 < farthest < 20.0  # units
 
 
+def test_a_scale_that_was_given_in_millimetres_is_doubted(walk):
+    pycolmap = registry.require("pycolmap", "colmap", "making a map")
+    _, found, made, *_ = walk
+    for larger, doubted in ((1.0, False), (1000.0, True), (0.001, True)):
+        model = copy.deepcopy(made.made.model)
+        model.transform(pycolmap.Sim3d(larger, pycolmap.Rotation3d(), np.zeros(3)))
+        given = replace(made, made=replace(made.made, model=model))
+        said = [line for line in summary(given, found) if "whether the scale was given in metres" in line]
+        assert bool(said) == doubted == ("whether the scale was given in metres" in map_report(given, found))
+        unknown = replace(given, scale=replace(made.scale, source=""))
+        assert not any("given in metres" in line for line in summary(unknown, found))
+
+
 def test_the_calibration_beside_the_photographs_is_taken(tmp_path, rng):
     for name in ("a.png", "b.png"):
         picture(tmp_path / name, 400, 300, rng)
@@ -646,6 +659,22 @@ def test_nothing_in_a_folder_of_a_stranger_is_left_out_in_silence(tmp_path, rng)
         "1 image was left out, in subfolders",
     ]
     assert "cut.jpg" in found.remarks[0] and "convert .heic" in found.remarks[1] and "inside" in found.remarks[2]
+
+
+def test_a_sound_image_is_not_said_to_be_damaged(tmp_path, rng, monkeypatch):
+    for name in ("a.png", "b.png"):
+        picture(tmp_path / name, 400, 200, rng)
+    monkeypatch.setattr("spherloc.images.MAX_PIXELS", 100_000)
+    picture(tmp_path / "large.png", 800, 400, rng)
+    assert cv2.imwrite(str(tmp_path / "depth.tif"), rng.random((200, 400)).astype(np.float32))
+    found = photographs(tmp_path, {})
+    assert [view.name for view in found.views] == ["a.png", "b.png"]
+    (said,) = found.remarks
+    assert said.startswith("2 images were left out that cannot be read. The first: ")
+    assert "depth.tif: has float32 pixels; give an image with 8 or 16 bits" in said
+    (tmp_path / "depth.tif").unlink()
+    (said,) = photographs(tmp_path, {}).remarks
+    assert "large.png: claims" in said and "100,000; give a smaller image" in said
 
 
 def test_raw_images_of_a_360_degree_camera_are_no_panoramas(tmp_path, rng):
@@ -961,7 +990,7 @@ def test_new_images_are_counted_by_their_size(tmp_path, rng):
         picture(new / name, *size, rng)
     (new / "d.jpg").write_text("no image")
     (empty / "notes.txt").write_text("nothing")
-    assert _sizes(NewImages(new, None)) == "2 of 400 x 200 pixels, 1 of 300 x 200 pixels, 1 damaged"
+    assert _sizes(NewImages(new, None)) == "2 of 400 x 200 pixels, 1 of 300 x 200 pixels, 1 that cannot be read"
     mapped = Photographs(tuple(view for view in photographs(new, {}).views if view.camera.width == 400), (), {})
     found, remarks = new_images_of(new, mapped)
     assert found == NewImages(new, None), "all that can be are of the map's camera"
@@ -976,6 +1005,8 @@ def test_new_images_are_counted_by_their_size(tmp_path, rng):
         new_images_of(new, mapped)
     with pytest.raises(InputError, match="empty: has no images; give a folder with images that are to be localized"):
         new_images_of(empty, mapped)
+    with pytest.raises(InputError, match=r"c\.png: is an image; give a folder with it and others that are to be local"):
+        new_images_of(new / "c.png", mapped)
 
 
 def test_scenes_of_the_map_before_are_told(walk):
@@ -987,6 +1018,10 @@ def test_scenes_of_the_map_before_are_told(walk):
         assert _of_the_map_before(folder, made) == []
         other.write_text(text.replace("points. Units are", "points, as yesterday. Units are"))
         assert _of_the_map_before(folder, made) == ["other.toml"]
+        assert load_scene(other).metric
+        other.write_text(text.replace('units = "metres"', 'units = "unknown"'))
+        with pytest.raises(InputError, match=r"units is 'unknown', but scene\.toml beside it has 'metres' for the"):
+            load_scene(other)
     finally:
         other.unlink()
 

@@ -1,5 +1,6 @@
 """The scale of a map by positions of another source, some of them wrong; their files, and GPS in photographs."""
 
+import warnings
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -209,7 +210,7 @@ def photographed(path, latitude, longitude):
     image.save(path, exif=exif)
 
 
-def test_gps_in_photographs(tmp_path):
+def test_gps_in_photographs(tmp_path, monkeypatch):
     """South and west have negative degrees; an image without tags, and one with senseless ones, have no position."""
     degrees = {f"{index}.jpg": np.array([-33.45 - 1e-4 * index, -70.66 + 2e-4 * index, 0.0]) for index in range(5)}
     for name, (latitude, longitude, _) in degrees.items():
@@ -222,6 +223,10 @@ def test_gps_in_photographs(tmp_path):
     for name, place in local_metres(degrees).items():
         np.testing.assert_allclose(found.by_name[name], place, atol=0.01)
     assert gps_of_images(views[:3]) is None
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 500)  # as an image beside which Pillow's own limit is small
+    with warnings.catch_warnings(action="error"):
+        large = gps_of_images(views)
+    assert large is not None and set(large.by_name) == set(degrees)
 
 
 @pytest.mark.parametrize(
