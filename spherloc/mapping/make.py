@@ -53,6 +53,10 @@ LENS_DOUBT = (
     "whether the lens, and so the shape of the map, is right: the map leaves directions open by {:.1f}°; photographs "
     "between which the camera was turned, or a calibration, make it sure"
 )
+UNTOLD_DOUBT = (
+    "whether the lens, and so the shape of the map, is right: pairs of the photographs do not tell it, only the map "
+    "does; photographs between which the camera was turned, or a calibration, make it sure"
+)
 
 
 @dataclass(frozen=True)
@@ -281,7 +285,7 @@ def _checked(folder: Path, request: MapRequest, tell: Tell) -> _LensChecked:
         raise (refused if lens.untold else error) from None
     if lens.untold and not told:
         raise refused
-    return checked
+    return replace(checked, doubts=(UNTOLD_DOUBT,)) if lens.untold else checked
 
 
 def _with_lens_of_map(

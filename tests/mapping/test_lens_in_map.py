@@ -211,7 +211,8 @@ def test_a_lens_that_pairs_do_not_tell_must_be_told_by_the_map(monkeypatch, tmp_
     lens = CalibratedLens(WRONG, "It was tried.", "they do not tell their lens")
     request = MapRequest([View("a.png", WRONG, Path("a.png"))], tmp_path, lens=lens)
     if said == (0.2, 0.02):
-        assert make._checked(tmp_path, request, lambda *_: None).built is built
+        found = make._checked(tmp_path, request, lambda *_: None)
+        assert found.built is built and found.doubts == (make.UNTOLD_DOUBT,)
         return
     with pytest.raises(InputError, match=r"have no calibration, and they do not tell their lens\. Or .*--camera"):
         make._checked(tmp_path, request, lambda *_: None)
