@@ -28,7 +28,7 @@ from spherloc.files import is_image, names_in
 from spherloc.geometry import camera_centre
 from spherloc.images import read_image
 from spherloc.mapping.make import MapRequest, make_map
-from spherloc.mapping.photographs import photographs
+from spherloc.mapping.photographs import CalibratedLens, photographs
 from spherloc.mapping.scene_files import toml_value
 from spherloc.mapping.unknown_lens import find_lens
 from spherloc.types import FloatArray
@@ -82,6 +82,7 @@ WALKS = (
     Walk("square, action camera, turned", "campus", ACTION, 8, 8, 35.0),
     Walk("square, stereographic, turned", "campus", STEREOGRAPHIC, 8, 8, -40.0),
     Walk("square, stereographic, straight", "campus", STEREOGRAPHIC, 14),
+    Walk("square, equidistant, straight", "campus", EQUIDISTANT, 20),
 )
 
 
@@ -131,13 +132,13 @@ def of_panoramas(panoramas: Path) -> str:
             found = photographs(folder, {}, find_lens=_find)
         except InputError as error:
             return str(error)
-    lens, _ = found.calibrated[""]
+    lens = found.calibrated[""].camera
     off_deg = lens_off_deg(lens, CUT, CUT_RADIUS_PX)
     focal = f"{lens.to_dict()['fx']:.1f} pixels per radian, in truth {CUT.fx}"
     return f"{found.remarks[0]}\nThe lens is {off_deg:.2f}° off at most: {focal}."
 
 
-def _find(paths: Sequence[Path], size: tuple[int, int]) -> tuple[Camera, str]:
+def _find(paths: Sequence[Path], size: tuple[int, int]) -> CalibratedLens:
     return find_lens(paths, size, lambda *_: None)
 
 
@@ -155,11 +156,12 @@ def mapped(folder: Path, cameras: dict[str, Camera], places: dict[str, FloatArra
     """How the maps of a folder are off, in a cell of the table, and the lens that was found."""
     photos = photographs(folder, cameras, find_lens=_find)
     with TemporaryDirectory() as place:
-        made = make_map(MapRequest(photos.views, folder), Path(place) / "map")
+        made = make_map(MapRequest(photos.views, folder, lens=photos.calibrated.get("")), Path(place) / "map")
         maps = [one.written.poses for one in (made, *made.groups)]
     off = np.concatenate([errors_m(poses, places) for poses in maps if len(poses) >= FEW])
     sizes = " + ".join(str(len(poses)) for poses in maps)
-    return f"{sizes}: {100 * np.median(off):.1f} cm", photos.calibrated.get("", (None, ""))[0]
+    doubt = ", in doubt" if made.doubts else ""
+    return f"{sizes}: {100 * np.median(off):.1f} cm{doubt}", None if made.lens is None else made.lens.camera
 
 
 def row(walk: Walk) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from math import degrees, radians
 from pathlib import Path
 
 from spherloc.errors import InputError, SpherlocError, StoppedError, show
@@ -13,12 +14,14 @@ from spherloc.mapping.advice import advice
 from spherloc.mapping.carried import carried_nadir_deg
 from spherloc.mapping.kept_models import forget, kept_or_made
 from spherloc.mapping.later import place_rest
+from spherloc.mapping.lens_in_map import lens_in_map
 from spherloc.mapping.line_gravity import GravityByLines, gravity_by_lines
 from spherloc.mapping.matched import DATABASES
 from spherloc.mapping.misplaced import far_off
 from spherloc.mapping.model import Reconstruction
 from spherloc.mapping.new_images import NewImages
 from spherloc.mapping.parallel import Tell
+from spherloc.mapping.photographs import CalibratedLens
 from spherloc.mapping.positions import Positions, gps_of_images
 from spherloc.mapping.reconstruction import reconstruct
 from spherloc.mapping.rig import Shots, disagree, misfits, shots_of, went_apart
@@ -41,6 +44,19 @@ MIN_OF_GROUP = 2
 """Least number of images of such a map."""
 MIN_POINTS_OF_TWO = 200
 """Least number of points of such a map of two images, which nothing else confirms."""
+
+MOVED_RAD, DOUBT_RAD = radians(0.5), radians(1.0)
+"""A map is made anew with a lens that it fits better if directions differ by the first angle, and the lens is in doubt
+if, then, they still differ by the second or are not known better."""
+CORRECTED = "A first map was fitted better by a lens whose directions differ by up to {:.1f}°, which is taken instead."
+LENS_DOUBT = (
+    "whether the lens, and so the shape of the map, is right: the map leaves directions open by {:.1f}°; photographs "
+    "between which the camera was turned, or a calibration, make it sure"
+)
+UNTOLD_DOUBT = (
+    "whether the lens, and so the shape of the map, is right: pairs of the photographs do not tell it, only the map "
+    "does; photographs between which the camera was turned, or a calibration, make it sure"
+)
 
 
 @dataclass(frozen=True)
@@ -75,6 +91,19 @@ class MapRequest:
     """Whether what moves with the camera below panoramas is found and left out, too."""
     stated: StatedGravity | None = None
     """Gravity that a file states."""
+    lens: CalibratedLens | None = None
+    """The lens that the photographs told, which the map may correct."""
+
+    def with_lens(self, before: CalibratedLens, lens: CalibratedLens) -> "MapRequest":
+        """The request with another lens instead of the one ``before``, for the views and the new images."""
+
+        def changed(views: Sequence[View]) -> tuple[View, ...]:
+            return tuple(replace(view, camera=lens.camera) if view.camera == before.camera else view for view in views)
+
+        new = self.new_images
+        if new is not None and new.views is not None:
+            new = replace(new, views=changed(new.views))
+        return replace(self, views=changed(self.views), new_images=new, lens=lens)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,17 +126,23 @@ class Map:
     stated: Mapping[str, Gravity] = field(default_factory=dict)
     """Gravity of photographs that a file or their tags state, by name."""
     doubts: tuple[str, ...] = ()
-    """Sentences on how that contradicts the photographs."""
+    """Sentences on how that contradicts the photographs, and on a lens that the map does not confirm."""
     opposed: tuple[str, str] | None = None
     """Two cameras that took images together, but went different ways in this map, or in it and one of ``groups``."""
+    lens: CalibratedLens | None = None
+    """The lens that the photographs told, or the one that a first map of them fitted better, and how it was found."""
+    corrected_rad: float = 0.0
+    """Largest angle by which directions differ between those two."""
 
 
 def make_map(request: MapRequest, folder: Path, tell: Tell = lambda *_: None) -> Map:
     """Make a map and write it into ``folder``, with a scene for the new images too.
 
-    Raises ``InputError`` if the images give no map, if the measurement names other images, or if a file cannot be read:
-    then nothing is left in ``folder`` but a map that was finished before. Raises ``StoppedError`` if a file cannot be
-    written: what is done is kept there and not done again.
+    A lens that the photographs told is checked: the map is made anew with one that it fits clearly better.
+
+    Raises ``InputError`` if the images give no map or do not tell their lens, if the measurement names other images, or
+    if a file cannot be read: then nothing is left in ``folder`` but a map that was finished before. Raises
+    ``StoppedError`` if a file cannot be written: what is done is kept there and not done again.
     """
     names, distance = {view.name for view in request.views}, request.measured.distance
     for name in () if distance is None else distance[:2]:
@@ -146,28 +181,30 @@ def _folder_of_map(folder: Path) -> Iterator[None]:
 
 def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
     """``make_map`` in a folder that is there."""
-    views, masks, stated, measured = request.views, request.masks, request.stated, request.measured
-    if measured == ScaleMeasurement():
-        measured = ScaleMeasurement(positions=gps_of_images(views))
-    carried_deg = carried_nadir_deg(views, tell) if request.find_carried else 0.0
-    if carried_deg:
-        views, _ = Masks(nadir_deg=carried_deg).on(views)
-        masks = replace(masks or Masks(), nadir_deg=carried_deg)
-    kept = Kept(masks, request.how, stated)
+    if request.measured == ScaleMeasurement():
+        request = replace(request, measured=ScaleMeasurement(positions=gps_of_images(request.views)))
+    checked = _checked(folder, request, tell)
+    request, built = checked.request, checked.built
+    views, measured, stated = built.views, request.measured, request.stated
+    first, *others = built.models
+    kept = Kept(built.masks, request.how, stated)
     known = {} if stated is None else stated.found
-    lines = gravity_by_lines(views, tell, known)
-    believed = {**known, **({} if lines.unsure else lines.found)}
-    down = [believed.get(view.name) for view in views]
-    first, *others = kept_or_made(
-        views, down, folder, request.how, lambda: reconstruct(views, down, folder, tell, request.how)
-    )
-    lines = lines.in_map(first.poses, first.points())
+    lines = built.lines.in_map(first.poses, first.points())
     gravity = {**known, **lines.found}
     found = _finished(first, views, nearer_to_others(first, others), gravity, measured, tell)
     inside = set(found[0].poses)
     written = write_map(*found, views, request.images, folder, request.new_images, kept)
-    method, doubts = kept.how.features.method, () if stated is None else stated.doubts
-    made = Map(*found, written, lines, features=method, carried_deg=carried_deg, stated=known, doubts=doubts)
+    made = Map(
+        *found,
+        written,
+        lines,
+        features=kept.how.features.method,
+        carried_deg=built.carried_deg,
+        stated=known,
+        doubts=(*(() if stated is None else stated.doubts), *checked.doubts),
+        lens=request.lens,
+        corrected_rad=checked.corrected_rad,
+    )
     groups: list[Map] = []
     for other in others:
         if len(other.poses.keys() - inside) < MIN_OF_GROUP:
@@ -189,6 +226,97 @@ def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
         own = write_map(*found, views, request.images, place, request.new_images, kept)
         groups.append(replace(made, made=group, level=level, scale=scale, written=own))
     return replace(made, groups=tuple(groups), opposed=_opposed(made, groups, shots_of(views)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Built:
+    """Models of photographs, before level and scale."""
+
+    views: Sequence[View]
+    """The photographs, without what moves with the camera."""
+    masks: Masks | None
+    carried_deg: float
+    lines: GravityByLines
+    models: tuple[Reconstruction, ...]
+
+
+def _built(folder: Path, request: MapRequest, tell: Tell) -> _Built:
+    """The models of a request; raises as ``make_map``."""
+    views, masks = request.views, request.masks
+    carried_deg = carried_nadir_deg(views, tell) if request.find_carried else 0.0
+    if carried_deg:
+        views, _ = Masks(nadir_deg=carried_deg).on(views)
+        masks = replace(masks or Masks(), nadir_deg=carried_deg)
+    known = {} if request.stated is None else request.stated.found
+    lines = gravity_by_lines(views, tell, known)
+    believed = {**known, **({} if lines.unsure else lines.found)}
+    down = [believed.get(view.name) for view in views]
+    models = kept_or_made(views, down, folder, request.how, lambda: reconstruct(views, down, folder, tell, request.how))
+    return _Built(views, masks, carried_deg, lines, models)
+
+
+@dataclass(frozen=True, eq=False)
+class _LensChecked:
+    """What a map is made of, after its lens was checked."""
+
+    request: MapRequest
+    built: _Built
+    corrected_rad: float = 0.0
+    """See ``Map``."""
+    doubts: tuple[str, ...] = ()
+    """A sentence on the lens, if it is in doubt."""
+
+
+def _checked(folder: Path, request: MapRequest, tell: Tell) -> _LensChecked:
+    """The models, with the lens checked that the photographs told.
+
+    Raises ``InputError`` also if neither their pairs nor the models tell that lens.
+    """
+    lens = request.lens
+    if lens is None:
+        return _LensChecked(request, _built(folder, request, tell))
+    put_it = advice("calibration").format(files="their calibration")
+    refused = InputError(f"{request.images}: its photographs have no calibration, and {lens.untold}. Or {put_it}.")
+    try:
+        checked, told = _with_lens_of_map(folder, _LensChecked(request, _built(folder, request, tell)), lens, tell)
+    except StoppedError:
+        raise
+    except InputError as error:
+        raise (refused if lens.untold else error) from None
+    if lens.untold and not told:
+        raise refused
+    return replace(checked, doubts=(UNTOLD_DOUBT,)) if lens.untold else checked
+
+
+def _with_lens_of_map(
+    folder: Path, before: _LensChecked, lens: CalibratedLens, tell: Tell
+) -> tuple[_LensChecked, bool]:
+    """The models, made anew with the lens that they fit better if they do so clearly; a doubt if they contradict it or
+    leave it open, and whether they tell it."""
+    found, checked = lens_in_map(before.built.models[0], tell), before
+    if found is not None and found.moved_rad > max(MOVED_RAD, found.bound_rad):
+        better = lens._replace(camera=found.camera, how=f"{lens.how} {CORRECTED.format(degrees(found.moved_rad))}")
+        request = before.request.with_lens(lens, better)
+        try:
+            anew = _built(folder, request, tell)
+            again = lens_in_map(anew.models[0], tell)
+            if again is not None and _images(anew) >= _images(before.built):
+                checked, found = _LensChecked(request, anew, found.moved_rad), again
+        except StoppedError:
+            raise
+        except InputError:  # there is no map with that lens
+            pass
+    if found is None:
+        return checked, False
+    off_rad = max(found.moved_rad, found.bound_rad)
+    if off_rad <= DOUBT_RAD:
+        return checked, True
+    return replace(checked, doubts=(LENS_DOUBT.format(degrees(off_rad)),)), False
+
+
+def _images(built: _Built) -> int:
+    """Number of images in all models."""
+    return sum(len(one.poses) for one in built.models)
 
 
 def _opposed(made: Map, groups: Sequence[Map], shots: Shots) -> tuple[str, str] | None:

@@ -261,6 +261,8 @@ class ImagePairs:
 
     def _usable(self, geometry: Any) -> bool:
         kinds = self._pycolmap.TwoViewGeometryConfiguration
+        if geometry.cam2_from_cam1 is None:  # COLMAP found matches that fit, but no pose that they agree on
+            return False
         if geometry.config == kinds.PLANAR:
             return geometry.tri_angle < ONE_PLACE_RAD
         return geometry.config in (kinds.CALIBRATED, kinds.PANORAMIC)

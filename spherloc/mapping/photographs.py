@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
@@ -34,8 +35,18 @@ CALLED_CALIBRATION = re.compile("calib|camera|camchain|intrinsic|sensor|lens|cam
 MAX_CALIBRATIONS = 20
 """Largest number of files beside the photographs that are tried as a calibration."""
 
-CalibratedLens = tuple[Camera, str]
-"""A lens that was calibrated by the images that it took, and how, in sentences."""
+
+class CalibratedLens(NamedTuple):
+    """A lens that was calibrated by the images that it took."""
+
+    camera: Camera
+    how: str
+    """How it was, in sentences."""
+    untold: str = ""
+    """A part of a sentence that says why pairs of the images do not tell it, so that only their map may; empty if they
+    do."""
+
+
 LensFinder = Callable[[Sequence[Path], tuple[int, int]], CalibratedLens]
 """Calibrates a lens by images, all of a size (width, height); raises ``InputError`` with a part of a sentence if they
 do not tell it."""
@@ -300,9 +311,9 @@ def _of_folder(
         except InputError as error:
             none = "have no calibration that can be used" if unusable else "have no calibration"
             raise InputError(" ".join((f"{unknown} and {none}, and {error}. Or {put_it}.", *unused))) from None
-        camera_of = dict.fromkeys(sizes[order[0]], lens[0])
+        camera_of = dict.fromkeys(sizes[order[0]], lens.camera)
         rest = [name for name in rest if name not in camera_of]
-        remarks.append(lens[1])
+        remarks.append(lens.how)
     if rest:
         width, height = next(size for size, names in sizes.items() if rest[0] in names)
         of_another_size = bool(given) and all((one.width, one.height) != (width, height) for one in given.values())

@@ -16,7 +16,7 @@ from spherloc.datasets.asl_layout import camera_of_folder
 from spherloc.datasets.query_gravity import BOUND_SD
 from spherloc.datasets.scene_file import read_table
 from spherloc.errors import InputError, SpherlocError
-from spherloc.files import is_file, is_folder
+from spherloc.files import is_file, is_folder, read_file
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.new_images import NewImages
@@ -33,6 +33,10 @@ GRAVITY = "gravity.txt"
 """Gravity of the map's images by the IMU of a sequence that they are of, or by their tags."""
 LENS = "lens.toml"
 """Calibration file of a lens that the map's images told."""
+GIVEN = "Given as the calibration when the map was made."
+"""What such a file says of a lens that they did not tell."""
+_MAX_LENS = 1 << 16
+"""Bytes of such a file."""
 COMMENT_WIDTH = 110
 UNITS_UNKNOWN = 'units = "unknown"             # lengths are told in units of the map'
 UNITS_METRES = 'units = "metres"'
@@ -147,6 +151,14 @@ def kept_lens(path: Path) -> Camera | None:
         return None
 
 
+def was_given(path: Path) -> bool:
+    """Whether the file of a lens says that it was given."""
+    try:
+        return read_file(path, _MAX_LENS).decode("utf-8", "replace").startswith(f"# {GIVEN}")
+    except OSError:
+        return False
+
+
 def check_images_of(folder: Path, images: Path) -> None:
     """Raise ``InputError`` if there is a map in ``folder`` of photographs that are not in the folder ``images``."""
     scene = folder / SCENE
@@ -167,18 +179,19 @@ def lenses_given(views: Sequence[View]) -> dict[str, CalibratedLens]:
     for view in views:
         name = "" if Path(view.name).parent == Path() else camera_of_folder(view.path.parent)
         by_folder.setdefault(name, {})[repr(view.camera)] = view.camera
-    how = "Given as the calibration when the map was made."
-    return {name: (next(iter(found.values())), how) for name, found in by_folder.items() if len(found) == 1}
+    return {
+        name: CalibratedLens(next(iter(found.values())), GIVEN) for name, found in by_folder.items() if len(found) == 1
+    }
 
 
 def write_lenses(folder: Path, lenses: Mapping[str, CalibratedLens]) -> None:
     """Write the ``lens_path`` of lenses by name where another is there or none; raises ``OSError``."""
-    for name, (camera, how) in lenses.items():
+    for name, lens in lenses.items():
         path = lens_path(folder, name)
-        if kept_lens(path) == camera:
+        if kept_lens(path) == lens.camera:
             continue
-        about = [f"# {line}" for line in wrap(how, COMMENT_WIDTH)]
-        path.write_text("\n".join([*about, "[camera]", *_camera(camera)]) + "\n", encoding="utf-8")
+        about = [f"# {line}" for line in wrap(lens.how, COMMENT_WIDTH)]
+        path.write_text("\n".join([*about, "[camera]", *_camera(lens.camera)]) + "\n", encoding="utf-8")
 
 
 def write_new_scene(

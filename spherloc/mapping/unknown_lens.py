@@ -16,6 +16,7 @@ from spherloc.images import read_image
 from spherloc.mapping.image_circle import Circle, image_circle
 from spherloc.mapping.lens_fit import PixelPairs, fit_lens
 from spherloc.mapping.parallel import Tell, as_completed
+from spherloc.mapping.photographs import CalibratedLens
 from spherloc.registry import require
 from spherloc.types import BoolArray
 
@@ -38,8 +39,10 @@ MIN_HALF_RAD = radians(45.0)
 """Least angle to the optical axis of the corners or the rim of a wide lens."""
 
 
-def find_lens(paths: Sequence[Path], size: tuple[int, int], tell: Tell) -> tuple[KannalaBrandt, str]:
-    """The lens of images that one camera took, all of a size (width, height), and how well it is known, in a sentence.
+def find_lens(paths: Sequence[Path], size: tuple[int, int], tell: Tell) -> CalibratedLens:
+    """The lens of images that one camera took, all of a size (width, height), and how well it is known.
+
+    Where pairs of the images do not tell it, that is said as ``untold``.
 
     Raises ``InputError`` with a part of a sentence if the images do not tell it.
     """
@@ -60,15 +63,19 @@ def find_lens(paths: Sequence[Path], size: tuple[int, int], tell: Tell) -> tuple
     except (ValueError, CalibrationError):
         raise InputError("no lens fits the matches between them") from None
     half_rad = float(lens.angles(np.array([rim.radius]))[0])
-    if off_rad > MAX_OFF_RAD:
-        raise InputError(
-            f"they do not tell their lens: lenses that differ by {np.degrees(off_rad):.1f}° fit them or halves of "
-            "them, as where a camera only went straight ahead; add some that were taken with the camera turned"
-        )
     if half_rad < MIN_HALF_RAD:
         raise InputError(f"their lens seems to see {2.0 * np.degrees(half_rad):.0f}° only, and is no fisheye")
+    if off_rad > MAX_OFF_RAD:
+        return CalibratedLens(
+            camera,
+            "There was no calibration, and pairs of the photographs do not tell the lens: lenses that differ by "
+            f"{np.degrees(off_rad):.1f}° fit them or halves of them. One of these "
+            "is tried, and the map must tell better.",
+            f"they do not tell their lens: lenses that differ by {np.degrees(off_rad):.1f}° fit them or halves of "
+            "them, as where a camera only went straight ahead; add some that were taken with the camera turned",
+        )
     field_rad = 2.0 * float(lens.angles(np.array([fit.radii_px.max()]))[0])
-    return (
+    return CalibratedLens(
         camera,
         f"There was no calibration, so the lens was calibrated by {fit.matches:,} matches between the photographs, "
         f"which are spread over {np.degrees(field_rad):.0f}° of its view. Lenses that fit as well, or halves of them, "

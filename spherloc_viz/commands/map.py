@@ -55,6 +55,7 @@ from spherloc.mapping.scene_files import (
     kept_lens,
     lens_path,
     lenses_given,
+    was_given,
     write_lenses,
 )
 from spherloc.mapping.sequence import sequence_data
@@ -142,8 +143,10 @@ def make(
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
         try:
             scaled = ScaleMeasurement(positions=data.positions) if unscaled else measured
-            request = MapRequest(found.views, folder, scaled, others, masks, how, find_carried, stated)
+            told = _lens_told(found, target)
+            request = MapRequest(found.views, folder, scaled, others, masks, how, find_carried, stated, told)
             made = make_map(request, target, tell)
+            found = _with_lens(found, made)
         except KeyboardInterrupt:
             say("stopped; what is done is kept, and the same command goes on from there.")
             raise
@@ -193,14 +196,32 @@ def _lens_finder(tell: Tell, folder: Path, target: Path, new_images: Path | None
         path = lens_path(target, "" if place == folder else camera_of_folder(place))
         kept = kept_lens(path)
         if kept is not None and (kept.width, kept.height) == size:
-            return kept, f"The lens is that of {path}, as before; that file says where it is from, and may be removed."
+            how = f"The lens is that of {path}, as before; that file says where it is from, and may be removed."
+            return CalibratedLens(kept, how)
         more: list[Path] = []
         if new_images is not None and is_folder(new_images) and not _calibrated(new_images, size):
             new = [new_images / name for name in names_in(new_images) if is_image(name)]
             more = [path for path in new if _has_size(path, size)]
-        return find_lens([*paths, *more], size, tell)
+        found = find_lens([*paths, *more], size, tell)
+        if found.untold and place != folder:  # a map of several cameras is not asked about a lens
+            raise InputError(found.untold)
+        return found
 
     return find
+
+
+def _lens_told(found: Photographs, target: Path) -> CalibratedLens | None:
+    """The lens of all photographs that they told, now or for the map that was in ``target`` before; None if they are of
+    several cameras or their calibration was given."""
+    if len(found.calibrated) != 1 or len(cameras_of(found.views)) != 1:
+        return None
+    ((name, lens),) = found.calibrated.items()
+    return None if was_given(lens_path(target, name)) else lens
+
+
+def _with_lens(found: Photographs, made: Map) -> Photographs:
+    """The photographs with the lens with which their map was made."""
+    return found if made.lens is None else replace(found, calibrated=dict.fromkeys(found.calibrated, made.lens))
 
 
 def _calibrated(folder: Path, size: tuple[int, int]) -> bool:
@@ -380,8 +401,10 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
             unscaled = measured == ScaleMeasurement()
             data = sequence_data(folder, found.views, positions=unscaled)
             scaled = ScaleMeasurement(positions=data.positions) if unscaled else measured
-            request = MapRequest(found.views, folder, scaled, how=how_of(), stated=data.stated)
+            lens = _lens_told(found, output)
+            request = MapRequest(found.views, folder, scaled, how=how_of(), stated=data.stated, lens=lens)
             made = make_map(request, output, _progress)
+            found = _with_lens(found, made)
             _write(report, made, found, measured, {})
         except SpherlocError as error:
             _tell({"error": str(error)})

@@ -47,6 +47,7 @@ def summary(made: Map, found: Photographs) -> list[str]:
         *(f"joined        {said}" for said in _joined_words(made, found)),
         f"down          {_down(made)}",
         *_about_lines(made),
+        *([f"lens          {_corrected_words(made)}"] if made.corrected_rad else []),
         f"features      {about_features(made)}",
         f"scale         {made.scale.source or _units_unknown(made)}",
     ]
@@ -155,6 +156,13 @@ def _about_lines(made: Map) -> list[str]:
     return [f"no gravity    from the lines of {count} (see the report), such as {name}: {why}"]
 
 
+def _corrected_words(made: Map) -> str:
+    return (
+        f"corrected by up to {np.degrees(made.corrected_rad):.1f}°, as that fits a first map better; the map was made "
+        "anew with the corrected lens"
+    )
+
+
 def _carried_words(degrees: float) -> str:
     return (
         f"{degrees:g}° around straight down, where all images show the same: what carries the camera{advice('carried')}"
@@ -189,6 +197,7 @@ def map_report(made: Map, found: Photographs) -> str:
         "Mean reprojection error": f"{written.error_px:.2f} px",
         **({"Joined": joined} if (joined := "; ".join(_joined_words(made, found))) else {}),
         "Down": _down(made),
+        **({"Lens": _corrected_words(made)} if made.corrected_rad else {}),
         "Features": MAP_FEATURES[made.features],
         **({"Masked": _carried_words(made.carried_deg)} if made.carried_deg else {}),
         "Scale": scale,

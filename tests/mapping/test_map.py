@@ -366,6 +366,10 @@ def test_the_report_says_what_is_in_the_map(walk):
     told = f"far from the given positions: {names[4]} 9.50 m, {names[2]} 6.24 m; the map is wrong there"
     assert told in "".join(summary(off, found)) and f"Images {told}" in map_report(off, found)
     assert "in doubt" not in "".join(summary(made, found))
+    other = replace(made, corrected_rad=np.radians(2.96), doubts=("whether the lens is right",))
+    for said in ("\n".join(summary(other, found)), map_report(other, found)):
+        assert "corrected by up to 3.0°" in said and re.search("[Ii]n doubt:? +whether the lens is right", said)
+    assert "corrected" not in page
 
 
 def test_a_distance_to_an_image_that_is_not_in_the_map_leaves_the_units_unknown(walk):

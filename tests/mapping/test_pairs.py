@@ -108,6 +108,18 @@ def test_a_pose_of_drifting_clouds_is_none(rng):
     assert geometry is None
 
 
+def test_matches_that_fit_without_a_pose_are_no_pose(rng, monkeypatch):
+    """COLMAP says of some degenerate matches that they fit, but gives no pose."""
+    here, there, _ = street(rng, 150, 100)
+    pair = two_images(rng, here, there)
+    without = pycolmap.TwoViewGeometry()
+    without.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+    without.inlier_matches = np.tile(np.arange(len(here), dtype=np.uint32)[:, None], 2)
+    monkeypatch.setattr(pair, "_estimated", lambda *_: without)
+    _, geometry = pair.compare(0, 1)
+    assert geometry is None
+
+
 @pytest.mark.parametrize(
     ("camera", "right", "alike", "unsure"),
     [

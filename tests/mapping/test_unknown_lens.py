@@ -15,13 +15,13 @@ from spherloc.datasets import load_scene
 from spherloc.errors import InputError
 from spherloc.frontend.view import View
 from spherloc.geometry import so3_exp
-from spherloc.mapping import lens_fit
+from spherloc.mapping import lens_fit, unknown_lens
 from spherloc.mapping.image_circle import image_circle
 from spherloc.mapping.lens_fit import Circle, RadialLens, fit_lens
-from spherloc.mapping.photographs import photographs
+from spherloc.mapping.photographs import CalibratedLens, Photographs, photographs
 from spherloc.mapping.scene_files import LENS, lenses_given, write_lenses
 from spherloc.mapping.unknown_lens import MAX_OFF_RAD, find_lens
-from spherloc_viz.commands.map import _lens_finder
+from spherloc_viz.commands.map import _lens_finder, _lens_told
 
 TRUE = KannalaBrandt(900, 700, 270.0, 270.0, 458.0, 343.0, (-1 / 24, 1 / 1920, 0.0, 0.0))
 RIM = Circle(450.0, 350.0, float(np.hypot(450, 350)))
@@ -130,13 +130,15 @@ def test_photographs_without_a_calibration_are_given_the_lens_that_they_tell(tmp
     lens = KannalaBrandt(400, 300, 90.0, 90.0, 200.0, 150.0, (0.01, 0.0, 0.0, 0.0))
     asked = []
 
-    def finds(paths: list[Path], size: tuple[int, int]) -> tuple[KannalaBrandt, str]:
+    def finds(paths: list[Path], size: tuple[int, int]) -> CalibratedLens:
         asked.append(([path.name for path in paths], size))
-        return lens, "It was found."
+        return CalibratedLens(lens, "It was found.")
 
     found = photographs(tmp_path, {}, find_lens=finds)
     assert asked == [(["1.png", "2.png", "3.png"], (400, 300))]
-    assert [view.camera for view in found.views] == [lens] * 3 and found.calibrated == {"": (lens, "It was found.")}
+    assert [view.camera for view in found.views] == [lens] * 3 and found.calibrated == {
+        "": CalibratedLens(lens, "It was found.")
+    }
     assert found.remarks[0] == "It was found." and "1 of 4 images were left out" in found.remarks[1]
     write_lenses(tmp_path, found.calibrated)
     assert load_camera(tmp_path / LENS) == lens
@@ -146,7 +148,7 @@ def test_photographs_without_a_calibration_are_given_the_lens_that_they_tell(tmp
     assert [view.camera for view in beside.views] == [lens] * 3 and not asked and not beside.calibrated
     (tmp_path / LENS).unlink()
 
-    def refuses(paths: list[Path], size: tuple[int, int]) -> tuple[KannalaBrandt, str]:
+    def refuses(paths: list[Path], size: tuple[int, int]) -> CalibratedLens:
         raise InputError("they are too few")
 
     told = r"3 of 400 x 300 pixels, 1 of 300 x 300 pixels, .* have no calibration, and they are too few\. Or .*--camera"
@@ -157,13 +159,14 @@ def test_photographs_without_a_calibration_are_given_the_lens_that_they_tell(tmp
 def test_a_map_that_is_made_again_keeps_its_lens(tmp_path):
     """Of its images and of those in a folder, if they have the size; the file keeps how it was found."""
     lens = KannalaBrandt(400, 300, 90.0, 90.0, 200.0, 150.0, (0.01, 0.0, 0.0, 0.0))
-    write_lenses(tmp_path, {"": (lens, "It was found."), "left": (replace(lens, fx=95.0), "It was found, too.")})
+    left = CalibratedLens(replace(lens, fx=95.0), "It was found, too.")
+    write_lenses(tmp_path, {"": CalibratedLens(lens, "It was found."), "left": left})
     images = tmp_path / "images"
     find = _lens_finder(lambda *_: None, images, tmp_path, None)
-    found, how = find([images / "a.png"], (400, 300))
+    found, how, _ = find([images / "a.png"], (400, 300))
     assert found == lens and str(tmp_path / LENS) in how
     assert find([images / "left" / "a.png"], (400, 300))[0] == replace(lens, fx=95.0)
-    write_lenses(tmp_path, {"": (lens, how)})
+    write_lenses(tmp_path, {"": CalibratedLens(lens, how)})
     assert (tmp_path / LENS).read_text().startswith("# It was found.\n")
     views = [View(name, replace(lens, fx=fx), Path(name)) for name, fx in (("a", 91.0), ("up/a", 92.0), ("up/b", 93.0))]
     write_lenses(tmp_path, lenses_given(views))
@@ -187,6 +190,41 @@ def test_what_is_said_where_photographs_do_not_tell_their_lens(tmp_path, rng):
         find_lens(paths[:5], (300, 200), lambda *_: None)
     with pytest.raises(InputError, match="only 0 pairs of them match"):
         find_lens(paths, (300, 200), lambda *_: None)
+
+
+def test_a_lens_that_pairs_do_not_tell_is_left_to_the_map(tmp_path, monkeypatch):
+    """Of all photographs of a map, but not of those of one of several cameras."""
+    images = tmp_path / "images"
+    (images / "left").mkdir(parents=True)
+    paths = [images / f"{number}.png" for number in range(6)]
+    for path in (*paths, images / "left" / "0.png"):
+        cv2.imwrite(str(path), np.zeros((700, 900), np.uint8))
+    lens = RadialLens(270.0, 450.0, 350.0, 0.0, 0.0)
+    fit = lens_fit.LensFit(lens, 500, np.array([100.0, 400.0]), 100.0)
+    monkeypatch.setattr(unknown_lens, "_features", lambda *_: [])
+    monkeypatch.setattr(unknown_lens, "_pairs", lambda *_: [None] * 6)
+    monkeypatch.setattr(unknown_lens, "fit_lens", lambda *_, **__: (fit, np.radians(7.0)))
+    found = find_lens(paths, (900, 700), lambda *_: None)
+    assert found.camera == KannalaBrandt(900, 700, 270.0, 270.0, 450.0, 350.0, (0.0, 0.0, 0.0, 0.0))
+    assert "differ by 7.0°" in found.untold and "the map must tell better" in found.how
+    finder = _lens_finder(lambda *_: None, images, tmp_path, None)
+    assert finder(paths, (900, 700)) == found
+    with pytest.raises(InputError, match=r"lenses that differ by 7\.0° fit them"):
+        finder([images / "left" / "0.png"] * 6, (900, 700))
+
+
+def test_only_a_lens_that_the_photographs_told_is_left_to_the_map(tmp_path):
+    lens = CalibratedLens(TRUE, "It was found.")
+    views = tuple(View(name, TRUE, Path(name)) for name in ("a.png", "b.png"))
+    found = Photographs(views, (), {}, {"": lens})
+    assert _lens_told(found, tmp_path) == lens
+    assert _lens_told(replace(found, calibrated={}), tmp_path) is None
+    other = View("c.png", replace(TRUE, fx=271.0), Path("c.png"))
+    assert _lens_told(replace(found, views=(*views, other)), tmp_path) is None
+    write_lenses(tmp_path, {"": lens})
+    assert _lens_told(found, tmp_path) == lens
+    write_lenses(tmp_path, lenses_given([other]))
+    assert _lens_told(found, tmp_path) is None
 
 
 SCENE = """
@@ -222,7 +260,7 @@ def test_a_lens_is_found_by_images(tmp_path):
         cv2.imwrite(str(images[-1]), view.read())
         true = view.camera
     stages = []
-    camera, remark = find_lens(images, (420, 420), lambda kind, done, count: stages.append((kind, done, count)))
+    camera, remark, untold = find_lens(images, (420, 420), lambda kind, done, count: stages.append((kind, done, count)))
     radii = np.linspace(0.0, 200.0, 10)
     assert np.degrees(np.abs(angles(camera, radii) - angles(true, radii)).max()) < 1.5
     assert abs(camera.cx - true.cx) < 4 and abs(camera.cy - true.cy) < 4
@@ -237,5 +275,7 @@ def test_a_lens_is_found_by_images(tmp_path):
         "pairs matched for the lens",
         "fits of the lens to the matches",
     ]
-    again, _ = find_lens(images, (420, 420), lambda *_: None)
-    assert again == camera, "what is done is used again only if the lens is the same to the last bit"
+    again = find_lens(images, (420, 420), lambda *_: None)
+    assert not untold and again.camera == camera, (
+        "what is done is used again only if the lens is the same to the last bit"
+    )
