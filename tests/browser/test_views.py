@@ -196,9 +196,7 @@ def test_balls_are_on_the_screen_at_every_step_that_one_walks_to(tab: Playground
     numbers = sorted(map(int, str(last.get_attribute("data-touch")).removeprefix("select:").split(",")))
     tab.expect_card(*numbers)
     # A window over the page is what Escape closes first; what is selected stays, and the table of matches shows it.
-    tab.page.mouse.wheel(0, -5000)  # as a person does: else the page would scroll the row back under the press
-    expect(question).to_be_in_viewport()
-    question.click()
+    question.press("Enter")  # the page may just scroll the row into view, under a press of the mouse
     expect(tab.page.get_by_role("dialog")).to_have_count(1)
     tab.page.keyboard.press("Escape")
     expect(tab.page.get_by_role("dialog")).to_have_count(0)
