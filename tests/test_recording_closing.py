@@ -45,7 +45,7 @@ ENDS = """def look():
     with contextlib.suppress(Exception):
         examiner.examine(folder / "a.rrd")
 threading.Thread(target=look, daemon=True).start()
-while not pids.exists():
+while not (pids.exists() and pids.read_text()):
     time.sleep(0.01)"""
 
 
