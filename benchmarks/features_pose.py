@@ -4,8 +4,9 @@
 
 The last image of each camera of a pair of glasses is localized with the first two of all cameras, with those of the
 other two cameras, which look elsewhere, and with those of each camera alone. Gravity is that of the true pose, with a
-bound of 1 degree. ALIKED needs the extra ``learned``. The last column is the angle between the poses of the first two:
-where it is much smaller than their errors, the truth is what is off.
+bound of 1 degree. ALIKED needs the extra ``learned``. The last two columns judge without the truth, which is off
+between cameras: the angle between the poses of the first two, and the median reprojection error, by the pose of each
+kind, of matches that none of them has seen: the inliers of the pose by ORB.
 """
 
 import argparse
@@ -21,8 +22,10 @@ from spherloc.frontend.features import FeatureOptions
 from spherloc.frontend.matching import MatchOptions
 from spherloc.frontend.pipeline import FrontendOptions, ImageMatcher
 from spherloc.frontend.view import View
+from spherloc.geometry import transform
 from spherloc.metrics import evaluate, rotation_error_deg
 from spherloc.problem import Problem
+from spherloc.trace import Trace
 from spherloc.warm_up import warm_up
 
 DOWN_IN_MAP = (0.0, -1.0, 0.0)
@@ -32,35 +35,54 @@ KINDS = {
     "ALIKED": (FeatureOptions("aliked"), MatchOptions("lightglue")),
     "both": (FeatureOptions("sift+aliked"), MatchOptions("lightglue")),
 }
+UNSEEN = FeatureOptions("orb"), MatchOptions()
+ENOUGH_UNSEEN = 20
+
+
+def localized(query: View, references: tuple[View, ...], options: FrontendOptions, estimator: str) -> Trace:
+    """The query's pose by its matches with the references."""
+    assert query.cam_from_map is not None
+    matches = ImageMatcher(references, options)(query)
+    problem = Problem(
+        name=query.name,
+        camera=query.camera,
+        pixels=matches.pixels,
+        points=matches.points,
+        gravity_camera=query.cam_from_map[:, :3] @ DOWN_IN_MAP,
+        gravity_map=np.array(DOWN_IN_MAP),
+        gravity_bound_rad=float(np.radians(BOUND_DEG)),
+        bound_px=RIGHT_PX,
+        truth_cam_from_map=query.cam_from_map,
+    )
+    return estimate(problem, estimator, seed=0)
+
+
+def median_px(pose: np.ndarray, unseen: Trace) -> str:
+    """The median reprojection error by a pose of another trace's inliers, "-" where those are fewer than 20."""
+    kept = unseen.inlier_mask
+    if np.count_nonzero(kept) < ENOUGH_UNSEEN:
+        return "-"
+    seen, _ = unseen.problem.camera.project(transform(pose, unseen.problem.points[kept]))
+    return f"{np.median(np.linalg.norm(seen - unseen.problem.pixels[kept], axis=1)):.2f}"
 
 
 def row(name: str, query: View, references: tuple[View, ...], estimator: str) -> str:
     """A line of the table: the same query by all kinds of features."""
-    assert query.cam_from_map is not None
-    inliers, turned, moved, poses = [], [], [], []
-    for features, matching in KINDS.values():
-        matches = ImageMatcher(references, FrontendOptions(features, matching, len(references)))(query)
-        problem = Problem(
-            name=query.name,
-            camera=query.camera,
-            pixels=matches.pixels,
-            points=matches.points,
-            gravity_camera=query.cam_from_map[:, :3] @ DOWN_IN_MAP,
-            gravity_map=np.array(DOWN_IN_MAP),
-            gravity_bound_rad=float(np.radians(BOUND_DEG)),
-            bound_px=RIGHT_PX,
-            truth_cam_from_map=query.cam_from_map,
-        )
-        trace = estimate(problem, estimator, seed=0)
+    inliers, turned, moved, poses, unseen_px = [], [], [], [], []
+    unseen = localized(query, references, FrontendOptions(*UNSEEN, len(references)), estimator)
+    for kind in KINDS.values():
+        trace = localized(query, references, FrontendOptions(*kind, len(references)), estimator)
+        problem = trace.problem
         score = evaluate(trace)
         inliers.append(f"{np.count_nonzero(trace.inlier_mask):,} of {len(problem):,}")
         turned.append("-" if score.rotation_error_deg is None else f"{score.rotation_error_deg:.2f}")
         moved.append("-" if score.translation_error_m is None else f"{100 * score.translation_error_m:.1f}")
+        unseen_px.append("-" if trace.cam_from_map is None else median_px(trace.cam_from_map, unseen))
         if trace.cam_from_map is not None:
             poses.append(trace.cam_from_map)
     apart = f"{rotation_error_deg(*poses[:2]):.2f}" if len(poses) == len(KINDS) else "-"
     cells = [query.name.removeprefix("camera-").partition("_")[0], name]
-    cells += [*(" / ".join(each) for each in (inliers, turned, moved)), apart]
+    cells += [*(" / ".join(each) for each in (inliers, turned, moved)), apart, " / ".join(unseen_px)]
     return "| " + " | ".join(cells) + " |"
 
 
@@ -82,6 +104,7 @@ def main() -> int:
         "rotation error (deg)",
         "position error (cm)",
         "apart (deg)",
+        "ORB's matches (px)",
     )
     print("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|")
     for own in CAMERAS:

@@ -22,8 +22,9 @@ from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.datasets.scene_file import load_scene
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre, yaw_rotation
-from spherloc.mapping.make import MapRequest, make_map
+from spherloc.mapping.make import make_map
 from spherloc.mapping.photographs import photographs
+from spherloc.mapping.request import MapRequest
 from spherloc.types import ByteArray, FloatArray
 
 WORLDS = ("campus:0", "campus:7", "campus:11", "apartment:5")

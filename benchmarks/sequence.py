@@ -22,10 +22,11 @@ from scipy.spatial.transform import Rotation, Slerp
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.mapping.frames import FrameChoice
-from spherloc.mapping.make import MapRequest, ScaleMeasurement, make_map
+from spherloc.mapping.make import make_map
 from spherloc.mapping.new_images import new_images_of
 from spherloc.mapping.photographs import photographs
 from spherloc.mapping.positions import SimilarityFit, overlaid
+from spherloc.mapping.request import MapRequest, ScaleMeasurement
 from spherloc.mapping.sequence import sequence_data
 from spherloc.mapping.true_poses import truth_words
 from spherloc.types import FloatArray

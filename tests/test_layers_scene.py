@@ -178,6 +178,10 @@ def test_lengths_have_the_unit_of_their_size(length_m: float, said: str) -> None
     assert length_text(length_m) == said
 
 
+def test_one_is_one_unit() -> None:
+    assert [length_text(length, metric=False) for length in (0.5, 1.0, 2.0)] == ["0.5 units", "1 unit", "2 units"]
+
+
 @pytest.mark.parametrize(
     ("angle_deg", "said"),
     [(0.0117, "0.012°"), (0.13, "0.13°"), (0.0996, "0.10°"), (2.5, "2.50°"), (37.4, "37°"), (180.0, "180°")],

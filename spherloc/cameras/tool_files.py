@@ -234,19 +234,24 @@ def read_kalibr_chain(path: str | Path) -> dict[str, KalibrCamera]:
     Raises ``CalibrationError``, naming the file and the camera, for whatever cannot be used.
     """
     with located(str(path)):
-        tables = chain_tables(parse_yaml(read_text(Path(path))))
-        if not tables:
+        document = parse_yaml(read_text(Path(path)))
+        if not chain_tables(document):
             raise CalibrationError("has no 'cam0' at its top: give a camchain YAML of Kalibr.")
-        chain = {}
-        for name, table in tables.items():
-            camera = camera_of(name, table)
-            with located(name):
-                (shift_s,) = numbers_of({"timeshift_cam_imu": 0.0} | table, "timeshift_cam_imu")
-                cam_from_imu, imu_from_cam = _rigid(table, "T_cam_imu"), _rigid(table, "T_imu_cam")
-                if cam_from_imu is None and imu_from_cam is not None:
-                    cam_from_imu = np.asarray(np.linalg.inv(imu_from_cam), np.float64)
-                chain[name] = KalibrCamera(camera, cam_from_imu, _rigid(table, "T_cn_cnm1"), shift_s)
-        return chain
+        return kalibr_chain(document)
+
+
+def kalibr_chain(document: Any) -> dict[str, KalibrCamera]:
+    """The cameras of a camchain that is read, as ``read_kalibr_chain``; raises ``CalibrationError``."""
+    chain = {}
+    for name, table in chain_tables(document).items():
+        camera = camera_of(name, table)
+        with located(name):
+            (shift_s,) = numbers_of({"timeshift_cam_imu": 0.0} | table, "timeshift_cam_imu")
+            cam_from_imu, imu_from_cam = rigid(table, "T_cam_imu"), rigid(table, "T_imu_cam")
+            if cam_from_imu is None and imu_from_cam is not None:
+                cam_from_imu = np.asarray(np.linalg.inv(imu_from_cam), np.float64)
+            chain[name] = KalibrCamera(camera, cam_from_imu, rigid(table, "T_cn_cnm1"), shift_s)
+    return chain
 
 
 def read_body_from_sensor(path: Path) -> FloatArray | None:
@@ -262,7 +267,7 @@ def read_body_from_sensor(path: Path) -> FloatArray | None:
         if isinstance(matrix, dict):  # OpenCV's form
             numbers = list(list_of(matrix, "data", ", ".join(f"m{k}" for k in range(16))))
             matrix = [numbers[row : row + 4] for row in range(0, 16, 4)]
-        return _rigid({"T_BS": matrix}, "T_BS")
+        return rigid({"T_BS": matrix}, "T_BS")
 
 
 def chain_tables(document: Any) -> dict[str, Any]:
@@ -349,8 +354,9 @@ def _radial_tangential(table: dict[Any, Any]) -> tuple[float, float, float, floa
     return k1, k2, p1, p2
 
 
-def _rigid(table: dict[Any, Any], key: str) -> FloatArray | None:
-    """The rigid transform (4, 4) under ``key``, or None if there is none."""
+def rigid(table: dict[Any, Any], key: str) -> FloatArray | None:
+    """The rigid transform (4, 4) under ``key``, or None if there is none; raises ``CalibrationError`` for another
+    matrix."""
     if key not in table:
         return None
     rows = table[key]

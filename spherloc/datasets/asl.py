@@ -6,14 +6,15 @@ takes them from the IMU's frame to the camera's. Without a ``T_BS`` of the IMU i
 
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import camera_names, load_camera
-from spherloc.cameras.tool_files import read_body_from_sensor, read_kalibr_chain
+from spherloc.cameras.rig_files import read_rig
+from spherloc.cameras.tool_files import read_body_from_sensor
 from spherloc.datasets.asl_layout import MAV, SENSOR, TABLE, AslSequence
 from spherloc.datasets.imu import time_in_name
 from spherloc.errors import CalibrationError, InputError, shorten
@@ -159,17 +160,10 @@ def _of_chain(file: Path, sequence: AslSequence) -> dict[str, AslCamera]:
     """The cameras of the sequence that a file has by name; raises ``CalibrationError`` if it is none."""
     names = [name for name in camera_names(file) if name in sequence.cameras]
     found = {name: AslCamera(load_camera(file, name), file) for name in names}
-    with suppress(CalibrationError):  # a file of another kind, which does not tell of an IMU
-        body = body_from(sequence.sensor(IMU))
-        cam_from_imu: FloatArray | None = None
-        for name, one in read_kalibr_chain(file).items():
-            if one.cam_from_imu is not None:
-                cam_from_imu = one.cam_from_imu
-            elif cam_from_imu is not None and one.cam_from_previous is not None:
-                cam_from_imu = one.cam_from_previous @ cam_from_imu
-            else:
-                cam_from_imu = None
-            if name in found and cam_from_imu is not None:
-                body_from_camera = body @ np.linalg.inv(cam_from_imu)
-                found[name] = AslCamera(one.camera, file, body_from_camera, one.timeshift_s)
+    with suppress(CalibrationError):  # what it says of the IMU cannot be used
+        body, rig = body_from(sequence.sensor(IMU)), read_rig(file)
+        for name, imu_from_camera in rig.body_from_camera.items() if rig.of_imu else ():
+            if name in found:
+                shift_s = rig.shifts_s.get(name, 0.0)
+                found[name] = replace(found[name], body_from_camera=body @ imu_from_camera, shift_s=shift_s)
     return found

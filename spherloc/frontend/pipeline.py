@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.errors import InputError, show
+from spherloc.errors import InputError, ProblemError, show
 from spherloc.files import is_file
 from spherloc.frontend import retrieval
 from spherloc.frontend.feature_kinds import KINDS
@@ -121,8 +121,15 @@ class ImageMatcher:
     """Names of references by the name of a query, the most similar first."""
 
     def __call__(self, query: View) -> Matches:
-        """See ``Matcher``; if no reference can be used, there are no correspondences, and remarks say why."""
+        """See ``Matcher``; if no reference can be used, there are no correspondences, and remarks say why.
+
+        Raises ``InputError`` if the query cannot be read, and ``ProblemError`` if it has no features.
+        """
         features = extract(query, self.options.features)
+        if not len(features.pixels):
+            raise ProblemError(
+                f"{query.name} has no features, and so no matches; it is black, white, blurred or covered by a mask."
+            )
         tried, remarks = self._candidates(query, features)
         found: list[_ReferenceMatches] = []
         for reference in tried:

@@ -153,6 +153,6 @@ class Matcher(Protocol):
     """Finds the 2D-3D correspondences of a query image."""
 
     def __call__(self, query: View) -> Matches:
-        """The correspondences. Raises ``InputError`` if the query image cannot be read; a reference that cannot be used
-        becomes a remark."""
+        """The correspondences. Raises ``InputError`` if the query image cannot be read or has no features; a reference
+        that cannot be used becomes a remark."""
         ...

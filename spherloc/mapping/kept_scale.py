@@ -9,8 +9,8 @@ import numpy as np
 
 from spherloc.errors import InputError, reason
 from spherloc.files import read_file, write_whole
-from spherloc.mapping.make import ScaleMeasurement
 from spherloc.mapping.positions import Positions
+from spherloc.mapping.request import ScaleMeasurement
 
 FILE = "scale.json"
 MAX_BYTES = 1_000_000

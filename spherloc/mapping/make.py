@@ -1,32 +1,28 @@
 """Makes a map from photographs and writes it to the disk: all steps in their order."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from math import degrees, radians
+from functools import partial
 from pathlib import Path
 
 from spherloc.errors import InputError, SpherlocError, StoppedError, show
-from spherloc.frontend.masks import Masks
-from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
-from spherloc.mapping.carried import carried_nadir_deg
-from spherloc.mapping.kept_models import forget, kept_or_made
+from spherloc.mapping.checked_models import checked_models
+from spherloc.mapping.kept_models import forget
 from spherloc.mapping.later import place_rest
-from spherloc.mapping.lens_in_map import lens_in_map
-from spherloc.mapping.line_gravity import GravityByLines, gravity_by_lines
+from spherloc.mapping.line_gravity import GravityByLines
 from spherloc.mapping.matched import DATABASES
 from spherloc.mapping.misplaced import far_off
 from spherloc.mapping.model import Reconstruction
-from spherloc.mapping.new_images import NewImages
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.photographs import CalibratedLens
-from spherloc.mapping.positions import Positions, gps_of_images
-from spherloc.mapping.reconstruction import reconstruct
+from spherloc.mapping.positions import gps_of_images
+from spherloc.mapping.request import MapRequest, ScaleMeasurement
 from spherloc.mapping.rig import Shots, disagree, misfits, shots_of, went_apart
+from spherloc.mapping.rig_scale import scale_by_rig
 from spherloc.mapping.scene_files import SCENE
-from spherloc.mapping.stated_gravity import StatedGravity
 from spherloc.mapping.upright import (
     Level,
     MapScale,
@@ -44,66 +40,6 @@ MIN_OF_GROUP = 2
 """Least number of images of such a map."""
 MIN_POINTS_OF_TWO = 200
 """Least number of points of such a map of two images, which nothing else confirms."""
-
-MOVED_RAD, DOUBT_RAD = radians(0.5), radians(1.0)
-"""A map is made anew with a lens that it fits better if directions differ by the first angle, and the lens is in doubt
-if, then, they still differ by the second or are not known better."""
-CORRECTED = "A first map was fitted better by a lens whose directions differ by up to {:.1f}°, which is taken instead."
-LENS_DOUBT = (
-    "whether the lens, and so the shape of the map, is right: the map leaves directions open by {:.1f}°; photographs "
-    "between which the camera was turned, or a calibration, make it sure"
-)
-UNTOLD_DOUBT = (
-    "whether the lens, and so the shape of the map, is right: pairs of the photographs do not tell it, only the map "
-    "does; photographs between which the camera was turned, or a calibration, make it sure"
-)
-
-
-@dataclass(frozen=True)
-class ScaleMeasurement:
-    """A measurement that fixes the map's scale: one of these fields or none; GPS in the photographs is used then."""
-
-    camera_height_m: float | None = None
-    """Height of the cameras above the ground, m."""
-    distance: tuple[str, str, float] | None = None
-    """Names of two images, and their distance, m."""
-    positions: Positions | None = None
-    """Positions of the images from another source."""
-
-
-@dataclass(frozen=True, eq=False)
-class MapRequest:
-    """What a map is made of, and how."""
-
-    views: Sequence[View]
-    """Images of one camera or several."""
-    images: Path
-    """Their folder."""
-    measured: ScaleMeasurement = field(default_factory=ScaleMeasurement)
-    """What gives the scale."""
-    new_images: NewImages | None = None
-    """Other images, for which a scene is written too."""
-    masks: Masks | None = None
-    """The masks of the views, which are written into the scenes."""
-    how: FrontendOptions = field(default_factory=FrontendOptions)
-    """Which features are matched, and how."""
-    find_carried: bool = True
-    """Whether what moves with the camera below panoramas is found and left out, too."""
-    stated: StatedGravity | None = None
-    """Gravity that a file states."""
-    lens: CalibratedLens | None = None
-    """The lens that the photographs told, which the map may correct."""
-
-    def with_lens(self, before: CalibratedLens, lens: CalibratedLens) -> "MapRequest":
-        """The request with another lens instead of the one ``before``, for the views and the new images."""
-
-        def changed(views: Sequence[View]) -> tuple[View, ...]:
-            return tuple(replace(view, camera=lens.camera) if view.camera == before.camera else view for view in views)
-
-        new = self.new_images
-        if new is not None and new.views is not None:
-            new = replace(new, views=changed(new.views))
-        return replace(self, views=changed(self.views), new_images=new, lens=lens)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,9 +117,9 @@ def _folder_of_map(folder: Path) -> Iterator[None]:
 
 def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
     """``make_map`` in a folder that is there."""
-    if request.measured == ScaleMeasurement():
-        request = replace(request, measured=ScaleMeasurement(positions=gps_of_images(request.views)))
-    checked = _checked(folder, request, tell)
+    if not request.measured.given:
+        request = replace(request, measured=replace(request.measured, positions=gps_of_images(request.views)))
+    checked = checked_models(folder, request, tell)
     request, built = checked.request, checked.built
     views, measured, stated = built.views, request.measured, request.stated
     first, *others = built.models
@@ -226,97 +162,6 @@ def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
         own = write_map(*found, views, request.images, place, request.new_images, kept)
         groups.append(replace(made, made=group, level=level, scale=scale, written=own))
     return replace(made, groups=tuple(groups), opposed=_opposed(made, groups, shots_of(views)))
-
-
-@dataclass(frozen=True, eq=False)
-class _Built:
-    """Models of photographs, before level and scale."""
-
-    views: Sequence[View]
-    """The photographs, without what moves with the camera."""
-    masks: Masks | None
-    carried_deg: float
-    lines: GravityByLines
-    models: tuple[Reconstruction, ...]
-
-
-def _built(folder: Path, request: MapRequest, tell: Tell) -> _Built:
-    """The models of a request; raises as ``make_map``."""
-    views, masks = request.views, request.masks
-    carried_deg = carried_nadir_deg(views, tell) if request.find_carried else 0.0
-    if carried_deg:
-        views, _ = Masks(nadir_deg=carried_deg).on(views)
-        masks = replace(masks or Masks(), nadir_deg=carried_deg)
-    known = {} if request.stated is None else request.stated.found
-    lines = gravity_by_lines(views, tell, known)
-    believed = {**known, **({} if lines.unsure else lines.found)}
-    down = [believed.get(view.name) for view in views]
-    models = kept_or_made(views, down, folder, request.how, lambda: reconstruct(views, down, folder, tell, request.how))
-    return _Built(views, masks, carried_deg, lines, models)
-
-
-@dataclass(frozen=True, eq=False)
-class _LensChecked:
-    """What a map is made of, after its lens was checked."""
-
-    request: MapRequest
-    built: _Built
-    corrected_rad: float = 0.0
-    """See ``Map``."""
-    doubts: tuple[str, ...] = ()
-    """A sentence on the lens, if it is in doubt."""
-
-
-def _checked(folder: Path, request: MapRequest, tell: Tell) -> _LensChecked:
-    """The models, with the lens checked that the photographs told.
-
-    Raises ``InputError`` also if neither their pairs nor the models tell that lens.
-    """
-    lens = request.lens
-    if lens is None:
-        return _LensChecked(request, _built(folder, request, tell))
-    put_it = advice("calibration").format(files="their calibration")
-    refused = InputError(f"{request.images}: its photographs have no calibration, and {lens.untold}. Or {put_it}.")
-    try:
-        checked, told = _with_lens_of_map(folder, _LensChecked(request, _built(folder, request, tell)), lens, tell)
-    except StoppedError:
-        raise
-    except InputError as error:
-        raise (refused if lens.untold else error) from None
-    if lens.untold and not told:
-        raise refused
-    return replace(checked, doubts=(UNTOLD_DOUBT,)) if lens.untold else checked
-
-
-def _with_lens_of_map(
-    folder: Path, before: _LensChecked, lens: CalibratedLens, tell: Tell
-) -> tuple[_LensChecked, bool]:
-    """The models, made anew with the lens that they fit better if they do so clearly; a doubt if they contradict it or
-    leave it open, and whether they tell it."""
-    found, checked = lens_in_map(before.built.models[0], tell), before
-    if found is not None and found.moved_rad > max(MOVED_RAD, found.bound_rad):
-        better = lens._replace(camera=found.camera, how=f"{lens.how} {CORRECTED.format(degrees(found.moved_rad))}")
-        request = before.request.with_lens(lens, better)
-        try:
-            anew = _built(folder, request, tell)
-            again = lens_in_map(anew.models[0], tell)
-            if again is not None and _images(anew) >= _images(before.built):
-                checked, found = _LensChecked(request, anew, found.moved_rad), again
-        except StoppedError:
-            raise
-        except InputError:  # there is no map with that lens
-            pass
-    if found is None:
-        return checked, False
-    off_rad = max(found.moved_rad, found.bound_rad)
-    if off_rad <= DOUBT_RAD:
-        return checked, True
-    return replace(checked, doubts=(LENS_DOUBT.format(degrees(off_rad)),)), False
-
-
-def _images(built: _Built) -> int:
-    """Number of images in all models."""
-    return sum(len(one.poses) for one in built.models)
 
 
 def _opposed(made: Map, groups: Sequence[Map], shots: Shots) -> tuple[str, str] | None:
@@ -367,13 +212,22 @@ def _finished(
 
 def scale_of(made: Reconstruction, level: Level, measured: ScaleMeasurement) -> MapScale:
     """The scale by ``measured``; arbitrary, with the reason, if that does not fit: the map itself is finished."""
-    try:
-        if measured.distance is not None:
-            return scale_by_distance(made.poses, *measured.distance)
-        if measured.camera_height_m is not None:
-            return scale_by_height(made.poses, made.points(), level, measured.camera_height_m)
-        if measured.positions is not None:
-            return scale_by_positions(made.poses, measured.positions, level)
-    except InputError as error:
-        return replace(arbitrary_scale(made.depths()), why_unknown=str(error))
-    return arbitrary_scale(made.depths())
+    why_unknown = ""
+    for scale in _scales(made, level, measured):
+        try:
+            return scale()
+        except InputError as error:
+            why_unknown = why_unknown or str(error)
+    return replace(arbitrary_scale(made.depths()), why_unknown=why_unknown)
+
+
+def _scales(made: Reconstruction, level: Level, measured: ScaleMeasurement) -> Iterator[Callable[[], MapScale]]:
+    """What computes the scale, the best first; raises ``InputError`` when it is called and does not fit."""
+    if measured.distance is not None:
+        yield partial(scale_by_distance, made.poses, *measured.distance)
+    if measured.camera_height_m is not None:
+        yield partial(scale_by_height, made.poses, made.points(), level, measured.camera_height_m)
+    if measured.positions is not None:
+        yield partial(scale_by_positions, made.poses, measured.positions, level)
+    if measured.fixed is not None:
+        yield partial(scale_by_rig, made.poses, measured.fixed)

@@ -189,6 +189,11 @@ def _of_rows(path: Path, views: Sequence[View]) -> Positions:
             f"{path}: none of its {count} rows{first} names one of the {len(views)} images, such as "
             f"{show(views[0].name)}; use the file names of the images, with their folder and ending."
         )
+    if len(found) > 1 and len({tuple(at) for at in found.values()}) == 1:
+        raise InputError(
+            f"{path}: has the same position for all of its {len(found)} images, which gives no scale; give where each "
+            "of them was taken."
+        )
     if not in_degrees:
         if _are_degrees(np.array(list(found.values()))):
             raise InputError(
@@ -208,7 +213,8 @@ def _are_degrees(positions: FloatArray) -> bool:
     flat = positions[:, :2]
     spread, away = np.ptp(flat, axis=0).max(), np.abs(flat).max()
     in_range = np.sort(np.abs(flat).max(axis=0)) <= [90.0, 180.0]
-    return len(flat) >= MIN_POSITIONS and 100.0 * spread < away and spread < MAX_SPREAD_DEG and bool(in_range.all())
+    near = 0.0 < spread < min(MAX_SPREAD_DEG, 0.01 * away)
+    return len(flat) >= MIN_POSITIONS and near and bool(in_range.all())
 
 
 def _columns(words: Sequence[str], kinds: Sequence[set[str]]) -> list[int] | None:
@@ -293,7 +299,7 @@ def overlaid(points: FloatArray, positions: FloatArray) -> SimilarityFit:
         raise InputError("the positions, or the images of the map, are all in one place.")
     off = _off(fit, points, positions)
     variance = float(np.sum(off[near] ** 2)) / max(1, size * int(near.sum()) - unknowns)
-    spread = float(np.sum((positions[near] - positions[near].mean(axis=0)) ** 2))
+    spread = float(np.sum((fit[0] * (points[near] - points[near].mean(axis=0))) ** 2))
     return SimilarityFit(*fit, float(np.sqrt(variance / spread)), off, near)
 
 

@@ -66,19 +66,19 @@ def shots_of(views: Sequence[View]) -> Shots:
     return taken_together(_keys_of(views))
 
 
-def taken_together(keys: Mapping[str, Mapping[str, Key]]) -> Shots:
-    """Camera and time step of the images of those cameras that took most of their images together, by the keys of each
-    camera's images by name."""
-    numbers = {camera: images for camera, images in _numbers_of(keys).items() if len(images) >= MIN_TOGETHER}
+def taken_together(keys: Mapping[str, Mapping[str, Key]], least: int = MIN_TOGETHER) -> Shots:
+    """Camera and time step of the images of those cameras that took most of their images together, ``least`` or more,
+    by the keys of each camera's images by name."""
+    numbers = {camera: images for camera, images in _numbers_of(keys).items() if len(images) >= least}
     if len(numbers) < 2:
         return {}
     steps = _steps_of(numbers)
-    if len(steps) < MIN_TOGETHER:
+    if len(steps) < least:
         return {}
     found: dict[str, tuple[str, int]] = {}
     for camera, together in _in_steps(numbers, steps, _room(steps)).items():
         count = len({step for _, step in together.values()})
-        if count >= max(MIN_TOGETHER, SHARE_TOGETHER * min(len(numbers[camera]), len(steps))):
+        if count >= max(least, SHARE_TOGETHER * min(len(numbers[camera]), len(steps))):
             found.update(together)
     return found if len({camera for camera, _ in found.values()}) > 1 else {}
 

@@ -160,7 +160,11 @@ def was_given(path: Path) -> bool:
 
 
 def check_images_of(folder: Path, images: Path) -> None:
-    """Raise ``InputError`` if there is a map in ``folder`` of photographs that are not in the folder ``images``."""
+    """Raise ``InputError`` if ``folder``, for a map, is that of its photographs, ``images``, or has a map of others."""
+    if folder.resolve() == images.resolve():
+        raise InputError(
+            f"{folder}: is the folder of the photographs, and a map needs its own; {advice('own folder')}."
+        )
     scene = folder / SCENE
     if not is_file(scene):
         return

@@ -317,7 +317,7 @@ def map(
     from spherloc.cameras.calibration import camera_names
     from spherloc.datasets.query_gravity import camera_from_imu as rotation_of
     from spherloc.frontend.masks import Masks
-    from spherloc.mapping.make import ScaleMeasurement
+    from spherloc.mapping.request import ScaleMeasurement
     from spherloc_viz.commands.map import MAX_METRES, distance_of, make
 
     if sum(one is not None for one in (camera_height, distance or None, positions)) > 1:

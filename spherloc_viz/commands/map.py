@@ -36,7 +36,7 @@ from spherloc.mapping.given_cameras import given_cameras
 from spherloc.mapping.gravity_check import check_stated
 from spherloc.mapping.kept_scale import FILE as SCALE_FILE
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
-from spherloc.mapping.make import Map, MapRequest, ScaleMeasurement, make_map
+from spherloc.mapping.make import Map, make_map
 from spherloc.mapping.new_images import NewImages, new_images_of
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.photographs import (
@@ -48,6 +48,8 @@ from spherloc.mapping.photographs import (
     photographs,
 )
 from spherloc.mapping.positions import read_positions
+from spherloc.mapping.request import MapRequest, ScaleMeasurement
+from spherloc.mapping.rig_scale import fixed_images
 from spherloc.mapping.scene_files import (
     LENS,
     MAP_FOLDER,
@@ -142,7 +144,10 @@ def make(
                 say(f"{new_images}: {remark}")
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
         try:
-            scaled = ScaleMeasurement(positions=data.positions) if unscaled else measured
+            scaled = measured
+            if unscaled:
+                fixed = fixed_images(folder, found.views, None if camera is None else camera[0])
+                scaled = ScaleMeasurement(positions=data.positions, fixed=fixed)
             told = _lens_told(found, target)
             request = MapRequest(found.views, folder, scaled, others, masks, how, find_carried, stated, told)
             made = make_map(request, target, tell)
@@ -400,7 +405,10 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
                 measured = kept_scale(output)
             unscaled = measured == ScaleMeasurement()
             data = sequence_data(folder, found.views, positions=unscaled)
-            scaled = ScaleMeasurement(positions=data.positions) if unscaled else measured
+            if unscaled:
+                scaled = ScaleMeasurement(positions=data.positions, fixed=fixed_images(folder, found.views, None))
+            else:
+                scaled = measured
             lens = _lens_told(found, output)
             request = MapRequest(found.views, folder, scaled, how=how_of(), stated=data.stated, lens=lens)
             made = make_map(request, output, _progress)

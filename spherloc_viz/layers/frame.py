@@ -280,14 +280,14 @@ MIN_M = 1e-4
 """Shorter lengths are written as "less than" this."""
 
 
-UNITS = "units"
+UNIT, UNITS = "unit", "units"
 """Unit of a map whose scale is unknown."""
 
 
 def length_text(length_m: float, metric: bool = True) -> str:
     """A length as text with two digits, in a unit that suits its size; if not ``metric``, in units of the map."""
     if not metric:
-        return f"{length_m:.2g} {UNITS}"
+        return f"{length_m:.2g} {UNIT if length_m == 1.0 else UNITS}"
     if 0.0 < length_m < MIN_M:
         return "< 0.1 mm"
     for unit, metres in (("km", 1000.0), ("m", 1.0), ("cm", 0.01)):

@@ -183,11 +183,12 @@ def test_nothing_usable_gives_no_matches_and_one_sentence(queries, folder):
         map_scene(references, [queries["mei"]]).problem()
 
 
-def test_pictures_without_features_give_no_matches(references, folder):
+def test_pictures_without_features_give_no_matches_and_say_so(references, folder):
     path = folder / "fog.png"
     cv2.imwrite(str(path), np.full((290, 300), 90, np.uint8))
     fog = View("fog", FISHEYE, path, lift=references["fisheye"].lift)
-    assert len(matcher(references.values())(fog).pixels) == 0
+    with pytest.raises(ProblemError, match="fog has no features, and so no matches"):
+        matcher(references.values())(fog)
     assert len(matcher([fog])(references["fisheye"]).pixels) == 0
     assert len(matcher([fog, *references.values()], {"references": 1})(references["fisheye"]).references) == 1
 

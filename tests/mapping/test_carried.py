@@ -8,8 +8,9 @@ import pytest
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.frontend.masks import around
 from spherloc.mapping.carried import BELOW_DEG, carried_nadir_deg
-from spherloc.mapping.make import MapRequest, make_map
+from spherloc.mapping.make import make_map
 from spherloc.mapping.photographs import photographs
+from spherloc.mapping.request import MapRequest
 from spherloc_viz.commands.map_report import summary
 from tests.frontend.pictures import texture
 from tests.frontend.textured_rooms import FISHEYE, room_view, standing, wallpaper

@@ -13,12 +13,12 @@ from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.errors import InputError, StoppedError
 from spherloc.frontend.view import View
 from spherloc.geometry import so3_exp
-from spherloc.mapping import make
+from spherloc.mapping import checked_models as checks
 from spherloc.mapping.lens_in_map import LensInMap, lens_in_map
-from spherloc.mapping.make import MapRequest
 from spherloc.mapping.model import Reconstruction
 from spherloc.mapping.new_images import NewImages
 from spherloc.mapping.photographs import CalibratedLens
+from spherloc.mapping.request import MapRequest
 from spherloc.mapping.scene_files import lens_path, lenses_given, was_given, write_lenses
 
 TRUE = KannalaBrandt(640, 640, 239.0, 239.0, 319.0, 322.0, (0.003, 0.001, 0.0, 0.0))
@@ -157,9 +157,11 @@ def checked(monkeypatch, tmp_path):
                 raise InputError("COLMAP could not start a map.")
             return SimpleNamespace(models=[SimpleNamespace(poses=dict.fromkeys(range(anew)))])
 
-        monkeypatch.setattr(make, "lens_in_map", lambda *_: answers.pop(0))
-        monkeypatch.setattr(make, "_built", built)
-        found, _ = make._with_lens_of_map(tmp_path, make._LensChecked(request, before), request.lens, lambda *_: None)
+        monkeypatch.setattr(checks, "lens_in_map", lambda *_: answers.pop(0))
+        monkeypatch.setattr(checks, "_built", built)
+        found, _ = checks._with_lens_of_map(
+            tmp_path, checks.CheckedModels(request, before), request.lens, lambda *_: None
+        )
         assert not answers
         return found, found.built is not before
 
@@ -206,29 +208,29 @@ def test_a_map_that_is_worse_with_the_other_lens_is_not_taken(checked, images):
 def test_a_lens_that_pairs_do_not_tell_must_be_told_by_the_map(monkeypatch, tmp_path, said):
     answer = None if said is None else LensInMap(TRUE, radians(said[0]), radians(said[1]))
     built = SimpleNamespace(models=[SimpleNamespace(poses=dict.fromkeys(range(8)))])
-    monkeypatch.setattr(make, "lens_in_map", lambda *_: answer)
-    monkeypatch.setattr(make, "_built", lambda *_: built)
+    monkeypatch.setattr(checks, "lens_in_map", lambda *_: answer)
+    monkeypatch.setattr(checks, "_built", lambda *_: built)
     lens = CalibratedLens(WRONG, "It was tried.", "they do not tell their lens")
     request = MapRequest([View("a.png", WRONG, Path("a.png"))], tmp_path, lens=lens)
     if said == (0.2, 0.02):
-        found = make._checked(tmp_path, request, lambda *_: None)
-        assert found.built is built and found.doubts == (make.UNTOLD_DOUBT,)
+        found = checks.checked_models(tmp_path, request, lambda *_: None)
+        assert found.built is built and found.doubts == (checks.UNTOLD_DOUBT,)
         return
     with pytest.raises(InputError, match=r"have no calibration, and they do not tell their lens\. Or .*--camera"):
-        make._checked(tmp_path, request, lambda *_: None)
+        checks.checked_models(tmp_path, request, lambda *_: None)
 
 
 def test_a_map_that_cannot_be_made_with_a_lens_that_is_tried_says_that_it_is_the_lens(monkeypatch, tmp_path):
     def none(*_):
         raise InputError("no two of the photographs surely show the same place.")
 
-    monkeypatch.setattr(make, "_built", none)
+    monkeypatch.setattr(checks, "_built", none)
     request = MapRequest([], tmp_path, lens=CalibratedLens(WRONG, "It was tried.", "they do not tell their lens"))
     with pytest.raises(InputError, match="they do not tell their lens"):
-        make._checked(tmp_path, request, lambda *_: None)
+        checks.checked_models(tmp_path, request, lambda *_: None)
     request = MapRequest([], tmp_path, lens=CalibratedLens(WRONG, "It was found."))
     with pytest.raises(InputError, match="no two of the photographs"):
-        make._checked(tmp_path, request, lambda *_: None)
+        checks.checked_models(tmp_path, request, lambda *_: None)
 
 
 def test_a_full_disk_is_told_as_such(monkeypatch, tmp_path):
@@ -237,14 +239,17 @@ def test_a_full_disk_is_told_as_such(monkeypatch, tmp_path):
     def stopped(*_):
         raise StoppedError("make room there")
 
-    monkeypatch.setattr(make, "_built", stopped)
+    monkeypatch.setattr(checks, "_built", stopped)
     request = MapRequest([], tmp_path, lens=CalibratedLens(WRONG, "It was tried.", "they do not tell their lens"))
     with pytest.raises(StoppedError, match="make room"):
-        make._checked(tmp_path, request, lambda *_: None)
-    monkeypatch.setattr(make, "lens_in_map", lambda *_: LensInMap(TRUE, radians(2.0), radians(0.02)))
+        checks.checked_models(tmp_path, request, lambda *_: None)
+    monkeypatch.setattr(checks, "lens_in_map", lambda *_: LensInMap(TRUE, radians(2.0), radians(0.02)))
     with pytest.raises(StoppedError, match="make room"):
-        make._with_lens_of_map(
-            tmp_path, make._LensChecked(request, SimpleNamespace(models=[None])), request.lens, lambda *_: None
+        checks._with_lens_of_map(
+            tmp_path,
+            checks.CheckedModels(request, SimpleNamespace(models=[None])),
+            request.lens,
+            lambda *_: None,
         )
 
 

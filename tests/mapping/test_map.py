@@ -39,11 +39,12 @@ from spherloc.mapping.kept_models import FILE as KEPT_MODELS
 from spherloc.mapping.later import place_rest
 from spherloc.mapping.lens import for_colmap
 from spherloc.mapping.line_gravity import gravity_by_lines
-from spherloc.mapping.make import MapRequest, ScaleMeasurement, make_map, scale_of
+from spherloc.mapping.make import make_map, scale_of
 from spherloc.mapping.misplaced import far_off, without_misplaced
 from spherloc.mapping.new_images import NewImages, new_images_of
 from spherloc.mapping.new_queries import add_new_images, map_images
 from spherloc.mapping.photographs import Photographs, _is_in, photographs
+from spherloc.mapping.request import MapRequest, ScaleMeasurement
 from spherloc.mapping.scene_files import (
     MODEL,
     SCENE,
@@ -328,7 +329,7 @@ def test_models_are_kept_for_the_same_photographs_only(walk, tmp_path, monkeypat
     def refuse(*_):
         raise InputError("made again")
 
-    monkeypatch.setattr("spherloc.mapping.make.reconstruct", refuse)
+    monkeypatch.setattr("spherloc.mapping.checked_models.reconstruct", refuse)
     unscaled = asked(views)
     assert not unscaled.scale.source
     share = np.linalg.norm(unscaled.written.points, axis=1) / np.linalg.norm(made.written.points, axis=1)
@@ -441,7 +442,7 @@ def _no_lens(paths, size):
     raise InputError("they show nothing")
 
 
-def test_a_folder_with_the_map_of_other_photographs_is_not_taken(tmp_path):
+def test_a_folder_with_other_photographs_or_their_map_is_not_taken(tmp_path):
     """Two folders of one name would have one folder for their maps; one that is gone is not missed."""
     for name in ("monday", "tuesday", "map"):
         (tmp_path / name).mkdir()
@@ -450,6 +451,8 @@ def test_a_folder_with_the_map_of_other_photographs_is_not_taken(tmp_path):
     check_images_of(tmp_path / "map", tmp_path / "map" / ".." / "monday")
     with pytest.raises(InputError, match=r"holds the map of other photographs, those in .*monday; give another folder"):
         check_images_of(tmp_path / "map", tmp_path / "tuesday")
+    with pytest.raises(InputError, match="is the folder of the photographs, and a map needs its own; give another"):
+        check_images_of(tmp_path / "tuesday" / ".." / "monday", tmp_path / "monday")
     (tmp_path / "monday").rmdir()
     check_images_of(tmp_path / "map", tmp_path / "tuesday")
 

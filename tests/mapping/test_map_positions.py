@@ -13,8 +13,8 @@ from spherloc.errors import InputError
 from spherloc.frontend.view import View
 from spherloc.geometry import so3_exp
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
-from spherloc.mapping.make import ScaleMeasurement
 from spherloc.mapping.positions import Positions, gps_of_images, local_metres, overlaid, read_positions
+from spherloc.mapping.request import ScaleMeasurement
 from spherloc.mapping.upright import Level, MapScale, scale_by_positions
 from spherloc_viz.commands.map_report import other_units
 
@@ -186,6 +186,7 @@ def test_positions_without_heights_are_horizontal(tmp_path):
             "".join(f"{name} 50.00{index} 8.{index:03d} 120\n" for index, name in enumerate(NAMES)),
             "seem to be latitudes and longitudes in degrees, .*: image,lat,lon",
         ),
+        ("".join(f"{name} 50.1 8.2 120\n" for name in NAMES), "the same position for all of its 8 images"),
         ("100.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n", "no pose at the time of any of the 8 images"),
         ("5000.03 0 0 0 0 0 0 1\n5000.23 0 0 0 0 0 0 1\n", "no pose at the time of any of the 8 images"),
         ("100.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n", "line 3: its time is not after"),

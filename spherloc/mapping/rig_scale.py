@@ -1,0 +1,187 @@
+"""The scale of a map by cameras that are fixed to each other, as their calibration says: a stereo pair, a headset or a
+car with several fisheyes.
+
+Images that were taken together stand to each other as their cameras do, so that the distance of two of them in the map
+is known in metres. A single distance is as inexact as the two poses; many of them are not.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from spherloc.cameras.base import Camera
+from spherloc.cameras.calibration import load_camera
+from spherloc.cameras.rig_files import RigCalibration, read_rig
+from spherloc.cameras.scaling import scaled
+from spherloc.datasets.asl_layout import asl_sequence, camera_of_folder
+from spherloc.datasets.query_gravity import time_of
+from spherloc.errors import CalibrationError, InputError, shorten
+from spherloc.files import names_in
+from spherloc.frontend.view import View
+from spherloc.geometry import camera_centre, rotation_angle
+from spherloc.mapping.advice import advice
+from spherloc.mapping.lens import for_colmap
+from spherloc.mapping.photographs import CALIBRATIONS, MAX_CALIBRATIONS
+from spherloc.mapping.positions import MAX_SCALE_SD, NEAR_SD
+from spherloc.mapping.rig import TURNED_RAD, Key, camera_and_key, taken_together
+from spherloc.mapping.sequence import shots_of_sequence
+from spherloc.mapping.upright import MapScale
+from spherloc.types import FloatArray
+
+MIN_TIMES = 3
+"""Least number of times at which two cameras took images together."""
+MIN_BASELINE_M = 1e-3
+"""Cameras that are closer do not tell a scale."""
+PER_SD = 1.54
+"""Median length of a vector of three normal numbers, in their standard deviations."""
+MAX_OFF = 3.0
+"""A relative standard deviation that is larger tells nothing."""
+ROUNDS = 10
+"""Number of times that the scale is fitted to what fits it."""
+
+
+@dataclass(frozen=True, eq=False)
+class FixedImages:
+    """Images of cameras that are fixed to each other, as a calibration says."""
+
+    source: str
+    """The calibration, in a word."""
+    body_from_camera: Mapping[str, FloatArray]
+    """(4, 4), metres, by the name of the image."""
+    times: Mapping[int, Sequence[str]]
+    """Names of the images that were taken together, those of one camera first, by a number of their time."""
+
+
+def fixed_images(folder: Path, views: Sequence[View], file: Path | None) -> FixedImages | None:
+    """How the cameras of ``views``, photographs in ``folder``, are fixed to each other; None if no calibration says it.
+
+    The calibration is ``file``, else that of a sequence in the ASL layout, else a file in ``folder``.
+    """
+    sequence = None if file is not None else asl_sequence(folder)
+    if sequence is not None:
+        placed, files = {}, set[str]()
+        for shot in shots_of_sequence(sequence, views):
+            if shot.calibrated is not None and shot.calibrated.body_from_camera is not None:
+                placed[shot.name] = (shot.camera, shot.calibrated.body_from_camera)
+                files.add(sequence.called(shot.calibrated.file))
+        return _together(views, placed, " and ".join(sorted(files)))
+    names = [] if file is not None else [name for name in names_in(folder) if Path(name).suffix.lower() in CALIBRATIONS]
+    for path in [folder / name for name in names[:MAX_CALIBRATIONS]] if file is None else [file]:
+        try:
+            rig = read_rig(path)
+        except CalibrationError:  # told where its cameras are read
+            continue
+        if len(rig.body_from_camera) > 1 and (found := _together(views, _placed(path, rig, views), shorten(path.name))):
+            return found
+    return None
+
+
+def _placed(path: Path, rig: RigCalibration, views: Sequence[View]) -> dict[str, tuple[str, FloatArray]]:
+    """The camera's name and ``body_from_camera`` (4, 4) of the images that have one of a file's cameras; where several
+    have the same lens, the one that is called as the image's folder."""
+    names: dict[str, list[str]] = {}
+    for size in {(view.camera.width, view.camera.height) for view in views}:
+        for name in rig.body_from_camera:
+            camera = _for_images(path, name, size)
+            if camera is not None:
+                names.setdefault(repr(camera), []).append(name)
+    found = {}
+    for view in views:
+        called = names.get(repr(view.camera), [])
+        if len(called) > 1:
+            called = [name for name in called if name == camera_of_folder(Path(view.name).parent)]
+        if len(called) == 1:
+            found[view.name] = (called[0], rig.body_from_camera[called[0]])
+    return found
+
+
+def _for_images(path: Path, name: str, size: tuple[int, int]) -> Camera | None:
+    """A camera of a file as photographs of a size have it; None if they cannot have it."""
+    try:
+        camera: Camera | None = load_camera(path, name, size)
+        if camera is not None and (camera.width, camera.height) != size:
+            camera = scaled(camera, *size)
+        return None if camera is None else for_colmap(camera)[0]
+    except CalibrationError:
+        return None
+
+
+def _together(views: Sequence[View], placed: Mapping[str, tuple[str, FloatArray]], source: str) -> FixedImages | None:
+    """The images that were taken together, of those with a camera's name and ``body_from_camera`` (4, 4)."""
+    keys: dict[str, dict[str, Key]] = {}
+    for view in views:
+        if view.name in placed:
+            keys.setdefault(placed[view.name][0], {})[view.name] = camera_and_key(view.name, time_of(view))[1]
+    times: dict[int, list[str]] = {}
+    for name, (_, step) in sorted(taken_together(keys, MIN_TIMES).items()):
+        times.setdefault(step, []).append(name)
+    times = {step: names for step, names in times.items() if len(names) > 1}
+    bodies = {name: placed[name][1] for names in times.values() for name in names}
+    return FixedImages(source, bodies, times) if times else None
+
+
+def scale_by_rig(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScale:
+    """The scale at which images that were taken together are as far apart as their cameras.
+
+    ``poses`` (3, 4) are those of the map, by name. Raises ``InputError`` if there are too few such images in it, or if
+    these do not fix the scale to ``MAX_SCALE_SD``.
+    """
+    times = [[name for name in names if name in poses] for names in fixed.times.values()]
+    times = [names for names in times if len(names) > 1]
+    none = f"{fixed.source}, which says how the cameras are fixed to each other, gave no scale"
+    if len(times) < MIN_TIMES:
+        raise InputError(f"{none}: at {len(times)} times images of two cameras are in the map, {MIN_TIMES} are needed.")
+    pairs = [pair for names in times for pair in combinations(names, 2)]
+    between = [_between(poses, fixed.body_from_camera, pair) for pair in pairs]
+    stated, mapped = (np.array([one[k] for one in between]) for k in (0, 1))
+    turned_rad = np.array([one[2] for one in between])
+    alike = (turned_rad <= TURNED_RAD) & (np.linalg.norm(stated, axis=1) > MIN_BASELINE_M)
+    if 2 * np.count_nonzero(alike) < len(alike):
+        off_deg = np.degrees(np.median(turned_rad))
+        otherwise = f"in the map the cameras are turned against each other {off_deg:.0f}° otherwise than it says"
+        raise InputError(f"{none}: {otherwise}, or it has them in one place; {advice('other scale')}.")
+    stated, mapped = stated[alike], mapped[alike]
+    units, relative = _units_per_metre(stated, mapped)
+    # Of three images that were taken together the third distance tells nothing new, and few times tell little.
+    free = sum(len(names) - 1 for names in times)
+    relative *= float(np.sqrt(len(pairs) / free)) * (1.0 + 5.0 / (len(times) - 1))
+    lengths_m = np.linalg.norm(stated, axis=1)
+    shortest, longest = (f"{length_m:.2g}" for length_m in (lengths_m.min(), lengths_m.max()))
+    apart = f"{shortest} m" if shortest == longest else f"{shortest} to {longest} m"
+    seen = f"images that cameras {apart} apart took together, at {len(times)} times"
+    if not relative <= MAX_SCALE_SD:
+        off = f"uncertain by {relative:.0%}" if relative < MAX_OFF else "not known"
+        raise InputError(f"{none}: by {seen}, the scale is {off}; {advice('other scale')}.")
+    return MapScale(1.0 / units, f"{fixed.source}: {seen}; the scale is good to {max(relative, 5e-4):.1%}")
+
+
+def _between(
+    poses: Mapping[str, FloatArray], body_from_camera: Mapping[str, FloatArray], pair: tuple[str, str]
+) -> tuple[FloatArray, FloatArray, float]:
+    """The second image's position from the first one's in the frame of the body: as the calibration states it (3,), m,
+    and in the map (3,), in its units; and the angle, rad, between the frames of the body that the images tell."""
+    (first, second), (here, there) = ([known[name] for name in pair] for known in (body_from_camera, poses))
+    turns = first[:3, :3] @ here[:, :3], second[:3, :3] @ there[:, :3]
+    way = camera_centre(there) - camera_centre(here)
+    return second[:3, 3] - first[:3, 3], 0.5 * (turns[0] + turns[1]) @ way, rotation_angle(turns[0] @ turns[1].T)
+
+
+def _units_per_metre(stated: FloatArray, mapped: FloatArray) -> tuple[float, float]:
+    """The factor by which ``mapped`` (K, 3) are longer than ``stated`` (K, 3), and its relative standard deviation;
+    infinite if it is not positive.
+
+    Lengths would make it too large where positions are noisy, so that it is that of the parts along ``stated``. It is
+    fitted to those that fit the median.
+    """
+    squares = np.sum(stated**2, axis=1)
+    factors = np.sum(stated * mapped, axis=1) / squares
+    factor = float(np.median(factors))
+    for _ in range(ROUNDS):
+        off = np.linalg.norm(mapped - factor * stated, axis=1)
+        near = off <= NEAR_SD * np.median(off)
+        factor = float(np.sum(factors[near] * squares[near]) / np.sum(squares[near]))
+    sd = float(np.median(off)) / PER_SD / float(np.sqrt(np.sum(squares[near])))
+    return factor, sd / factor if factor > 0.0 else np.inf

@@ -1,0 +1,179 @@
+"""The scale of a map by cameras that are fixed to each other, as their calibration says."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from spherloc.errors import InputError
+from spherloc.geometry import pose
+from spherloc.mapping.given_cameras import given_cameras
+from spherloc.mapping.make import scale_of
+from spherloc.mapping.photographs import photographs
+from spherloc.mapping.positions import Positions
+from spherloc.mapping.request import ScaleMeasurement
+from spherloc.mapping.rig_scale import FixedImages, fixed_images, scale_by_rig
+from spherloc.mapping.upright import Level
+from tests.datasets.asl_tree import euroc, transform, tum_vi
+
+METRES_PER_UNIT = 3.7
+"""Of the maps."""
+
+
+def in_map(world_from_camera, rng, noise_m=0.0, turned_deg=0.0):
+    """The pose (3, 4) of a camera in a map with another origin, other axes and units."""
+    turn = Rotation.from_rotvec(np.radians(turned_deg) * rng.normal(size=3)).as_matrix()
+    map_from_world = Rotation.random(random_state=5).as_matrix()
+    centre = map_from_world @ (world_from_camera[:3, 3] + rng.normal(0.0, noise_m, 3) + [4.0, -2.0, 9.0])
+    rotation = turn @ world_from_camera[:3, :3].T @ map_from_world.T
+    return pose(rotation, -rotation @ centre / METRES_PER_UNIT)
+
+
+class Rig:
+    """Three cameras on a body that goes about, and a map of their images."""
+
+    def __init__(self, rng, times=12, noise_m=0.0, turned_deg=0.0):
+        self.bodies = {name: transform(Rotation.random(random_state=k).as_matrix(), rng.normal(0.0, 0.1, 3))
+                       for k, name in enumerate("abc")}  # fmt: skip
+        self.poses, together = {}, {}
+        for time in range(times):
+            world_from_body = transform(Rotation.random(random_state=100 + time).as_matrix(), rng.normal(0, 5, 3))
+            together[time] = [f"{name}{time}" for name in self.bodies]
+            for name, body in self.bodies.items():
+                self.poses[f"{name}{time}"] = in_map(world_from_body @ body, rng, noise_m, turned_deg)
+        bodies = {name: self.bodies[name[0]] for name in self.poses}
+        self.fixed = FixedImages("rig.json", bodies, together)
+
+    @property
+    def scale(self):
+        return scale_by_rig(self.poses, self.fixed)
+
+
+def test_the_scale_is_that_of_the_baselines(rng):
+    scale = Rig(rng).scale
+    assert scale.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=1e-9)
+    assert "rig.json: images that cameras" in scale.source and "at 12 times; the scale is good to" in scale.source
+
+
+def test_its_uncertainty_is_that_of_the_errors(rng):
+    """Noise of positions, which would make distances longer, and images that are misplaced."""
+    errors, told = [], []
+    for _ in range(60):
+        rig = Rig(rng, noise_m=0.01, turned_deg=0.2)
+        for name in ("a3", "b7"):
+            rig.poses[name] = pose(rig.poses[name][:, :3], rig.poses[name][:, 3] + rng.normal(0.0, 1.0, 3))
+        scale = rig.scale
+        errors.append(scale.metres_per_unit / METRES_PER_UNIT - 1.0)
+        told.append(float(scale.source.rpartition("good to ")[2].rstrip("%")) / 100.0)
+    rms = float(np.sqrt(np.mean(np.square(errors))))
+    assert 0.3 * rms < np.mean(told) < 3.0 * rms and abs(np.mean(errors)) < rms, (rms, np.mean(told), np.mean(errors))
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"times": 2}, "at 2 times images of two cameras are in the map, 3 are needed"),
+        (
+            {"noise_m": 0.5},
+            r"by images that cameras .* m apart took together, at 12 times, the scale is (uncertain|not)",
+        ),
+        ({"turned_deg": 20.0}, "turned against each other .*° otherwise than it says"),
+    ],
+)
+def test_what_gives_no_scale_is_told(rng, given, sentence):
+    with pytest.raises(InputError, match=f"rig.json, which says how .* gave no scale: .*{sentence}"):
+        _ = Rig(rng, **given).scale
+
+
+def test_images_that_are_not_in_the_map_do_not_count(rng):
+    rig = Rig(rng)
+    rig.poses = {name: one for name, one in rig.poses.items() if name[0] == "a" or name in ("b1", "c4", "b9")}
+    assert "at 3 times" in rig.scale.source
+    del rig.poses["b9"]
+    with pytest.raises(InputError, match="at 2 times"):
+        _ = rig.scale
+
+
+@pytest.mark.parametrize(("write", "key"), [(euroc, ""), (tum_vi, "T_imu_cam"), (tum_vi, "T_cn_cnm1")])
+def test_a_sequence_tells_how_its_cameras_are_fixed(tmp_path, rng, write, key):
+    tree = write(tmp_path / "room", rng, **({"key": key} if key else {}))
+    views = photographs(tree.folder, {}).views
+    fixed = fixed_images(tree.folder, views, None)
+    assert len(fixed.times) == len(tree.times) and all(len(names) == 2 for names in fixed.times.values())
+    assert ("camchain.yaml" if key else "mav0/cam0/sensor.yaml and mav0/cam1/sensor.yaml") in fixed.source
+    poses = {}
+    for view in views:
+        camera, time = view.path.parent.parent.name, int(view.path.stem)
+        poses[view.name] = in_map(tree.world_from_body[time] @ tree.body_from_camera[camera], rng)
+    assert scale_by_rig(poses, fixed).metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=1e-4)
+
+
+LENS = {"model": "OPENCV_FISHEYE", "width": 64, "height": 48, "params": [20, 20, 32, 24, 0, 0, 0, 0]}
+
+
+def written(folder, focal, size=(64, 48)):
+    """Images of two cameras, ``left_1.png`` and so on, with a calibration of both beside them."""
+    folder.mkdir()
+    for name in ("left", "right"):
+        for number in range(4):
+            cv2.imwrite(str(folder / f"{name}_{number}.png"), np.zeros((size[1], size[0]), np.uint8))
+    table = {
+        name: LENS | {"params": [f, f, *LENS["params"][2:]], "T_device_camera": transform(np.eye(3), at).tolist()}
+        for name, f, at in (("left", 20, (0, 0, 0)), ("right", focal, (0.2, 0, 0)))
+    }
+    (folder / "rig.json").write_text(json.dumps(table))
+    return folder
+
+
+def test_a_calibration_beside_images_or_given_tells_it(tmp_path):
+    folder = written(tmp_path / "beside", 21)
+    views = photographs(folder, {}).views
+    for file in (None, folder / "rig.json"):
+        fixed = fixed_images(folder, views, file)
+        assert fixed.source == "rig.json" and len(fixed.times) == 4
+        assert {name: body[0, 3] for name, body in fixed.body_from_camera.items()} == {
+            f"{name}_{number}.png": at for name, at in (("left", 0.0), ("right", 0.2)) for number in range(4)
+        }
+    (folder / "rig.json").write_text(json.dumps({"left": LENS, "right": LENS}))
+    assert fixed_images(folder, views, None) is None
+
+
+def test_images_that_were_scaled_are_known_too(tmp_path):
+    folder = written(tmp_path / "half", 21, (32, 24))
+    cameras, _ = given_cameras(folder / "rig.json", None, folder)
+    fixed = fixed_images(folder, photographs(folder, cameras).views, folder / "rig.json")
+    assert len(fixed.times) == 4
+
+
+def test_cameras_with_one_lens_are_told_apart_by_their_folders(tmp_path):
+    """Else it is not known which took an image, and nothing is told."""
+    folder = written(tmp_path / "same", 20)
+    assert fixed_images(folder, photographs(folder, {}).views, None) is None
+    for name in ("left", "right"):
+        (folder / name).mkdir()
+        for path in folder.glob(f"{name}_*.png"):
+            path.rename(folder / name / path.name.removeprefix(f"{name}_"))
+    fixed = fixed_images(folder, photographs(folder, {}).views, None)
+    assert fixed is not None and sorted(fixed.times[0]) == ["left/0.png", "right/0.png"]
+
+
+def test_it_is_used_where_positions_give_no_scale(rng):
+    rig = Rig(rng)
+
+    class Made:
+        poses = rig.poses
+
+        def depths(self):
+            return np.array([2.0])
+
+    level = Level(np.array([0.0, 1.0, 0.0]), "", 0.0, {})
+    centres = {name: -one[:, :3].T @ one[:, 3] for name, one in rig.poses.items()}
+    gps = Positions({name: 5.0 * centre for name, centre in centres.items()}, "GPS")
+    far = Positions({name: rng.normal(size=3) for name in centres}, "GPS")
+    for positions, scale in ((gps, 5.0), (far, METRES_PER_UNIT), (None, METRES_PER_UNIT)):
+        found = scale_of(Made(), level, ScaleMeasurement(positions=positions, fixed=rig.fixed))
+        assert found.metres_per_unit == pytest.approx(scale, rel=1e-6) and found.source
+    found = scale_of(Made(), level, ScaleMeasurement(positions=far))
+    assert not found.source and "GPS gave no scale" in found.why_unknown
