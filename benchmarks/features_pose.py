@@ -104,7 +104,7 @@ def main() -> int:
         "rotation error (deg)",
         "position error (cm)",
         "apart (deg)",
-        "ORB's matches (px)",
+        "ORB (px)",
     )
     print("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|")
     for own in CAMERAS:

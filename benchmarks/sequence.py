@@ -6,7 +6,8 @@ Two fisheyes that sway as a walker's are drawn along a part of the campus, four 
 blurred copies at 20 Hz, so that those that are drawn are the sharpest of their stretches. The IMU has 200 Hz and noise,
 the body's frame is that of neither sensor, and the ground truth has another origin and other axes. Positions are
 compared with the truth after the similarity that most images agree with, and so are the true poses that other images of
-the sequence get by its ground truth. Needs the extra ``colmap``.
+the sequence get by its ground truth. The scale is also measured by the distance of the two cameras. Needs the extra
+``colmap``.
 """
 
 import argparse
@@ -27,6 +28,7 @@ from spherloc.mapping.new_images import new_images_of
 from spherloc.mapping.photographs import photographs
 from spherloc.mapping.positions import SimilarityFit, overlaid
 from spherloc.mapping.request import MapRequest, ScaleMeasurement
+from spherloc.mapping.rig_scale import fixed_images, scale_by_rig
 from spherloc.mapping.sequence import sequence_data
 from spherloc.mapping.true_poses import truth_words
 from spherloc.types import FloatArray
@@ -129,7 +131,8 @@ def main() -> None:
         truth = written(folder)
         start = time.perf_counter()
         found = photographs(folder, {}, choice=FrameChoice(frames))
-        data = sequence_data(folder, found.views)
+        data, fixed = sequence_data(folder, found.views), fixed_images(folder, found.views, None)
+        assert fixed is not None
         print("\n".join([*found.remarks, *data.remarks]))
         measured = ScaleMeasurement(positions=data.positions)
         others, _ = new_images_of(folder, found, choice=FrameChoice(frames))
@@ -145,6 +148,8 @@ def main() -> None:
         f"positions {100 * np.median(fit.off_m):.1f} cm (median), down {np.median(leans):.2f}°, "
         f"scale {100 * (1.0 / fit.scale - 1.0):+.2f} %, {seconds:.0f} s"
     )
+    rig = scale_by_rig(mapped, fixed)
+    print(f"without ground truth: {rig.source}; it is off by {100 * (rig.metres_per_unit / fit.scale - 1.0):+.2f} %")
     if made.written.truth is not None:
         print(truth_words(made.written.truth))
         print(true_poses_off(made.written.truth.poses, truth, fit))
