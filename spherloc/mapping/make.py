@@ -21,7 +21,7 @@ from spherloc.mapping.photographs import CalibratedLens
 from spherloc.mapping.positions import gps_of_images
 from spherloc.mapping.request import MapRequest, ScaleMeasurement
 from spherloc.mapping.rig import Shots, disagree, misfits, shots_of, went_apart
-from spherloc.mapping.rig_scale import scale_by_rig
+from spherloc.mapping.rig_scale import doubt_of_scale, scale_by_rig
 from spherloc.mapping.scene_files import SCENE
 from spherloc.mapping.upright import (
     Level,
@@ -129,6 +129,9 @@ def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
     gravity = {**known, **lines.found}
     found = _finished(first, views, nearer_to_others(first, others), gravity, measured, tell)
     inside = set(found[0].poses)
+    doubts = [*(() if stated is None else stated.doubts), *checked.doubts]
+    if measured.fixed is not None and found[2].source:
+        doubts += filter(None, [doubt_of_scale(found[0].poses, found[2], measured.fixed)])
     written = write_map(*found, views, request.images, folder, request.new_images, kept)
     made = Map(
         *found,
@@ -137,7 +140,7 @@ def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
         features=kept.how.features.method,
         carried_deg=built.carried_deg,
         stated=known,
-        doubts=(*(() if stated is None else stated.doubts), *checked.doubts),
+        doubts=tuple(doubts),
         lens=request.lens,
         corrected_rad=checked.corrected_rad,
     )

@@ -37,6 +37,8 @@ MIN_BASELINE_M = 1e-3
 """Cameras that are closer do not tell a scale."""
 PER_SD = 1.54
 """Median length of a vector of three normal numbers, in their standard deviations."""
+ALIKE = 1.2
+"""A scale that differs by a larger factor is in doubt."""
 MAX_OFF = 3.0
 """A relative standard deviation that is larger tells nothing."""
 ROUNDS = 10
@@ -156,6 +158,22 @@ def scale_by_rig(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScal
         off = f"uncertain by {relative:.0%}" if relative < MAX_OFF else "not known"
         raise InputError(f"{none}: by {seen}, the scale is {off}; {advice('other scale')}.")
     return MapScale(1.0 / units, f"{fixed.source}: {seen}; the scale is good to {max(relative, 5e-4):.1%}")
+
+
+def doubt_of_scale(poses: Mapping[str, FloatArray], scale: MapScale, fixed: FixedImages) -> str:
+    """A part of a sentence if a scale of a map of ``poses`` (3, 4) is clearly not that of ``scale_by_rig``; empty if it
+    is, or if that is not known."""
+    try:
+        by_rig = scale_by_rig(poses, fixed)
+    except InputError:
+        return ""
+    times = by_rig.metres_per_unit / scale.metres_per_unit
+    if max(times, 1.0 / times) <= ALIKE:
+        return ""
+    return (
+        f"whether the scale is right: by the distances of the cameras in {fixed.source} the map is {times:.2g} times as "
+        "large; one of the two is wrong or has another unit"
+    )
 
 
 def _between(

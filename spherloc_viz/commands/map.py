@@ -144,10 +144,8 @@ def make(
                 say(f"{new_images}: {remark}")
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
         try:
-            scaled = measured
-            if unscaled:
-                fixed = fixed_images(folder, found.views, None if camera is None else camera[0])
-                scaled = ScaleMeasurement(positions=data.positions, fixed=fixed)
+            fixed = fixed_images(folder, found.views, None if camera is None else camera[0])
+            scaled = replace(ScaleMeasurement(positions=data.positions) if unscaled else measured, fixed=fixed)
             told = _lens_told(found, target)
             request = MapRequest(found.views, folder, scaled, others, masks, how, find_carried, stated, told)
             made = make_map(request, target, tell)
@@ -405,10 +403,8 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
                 measured = kept_scale(output)
             unscaled = measured == ScaleMeasurement()
             data = sequence_data(folder, found.views, positions=unscaled)
-            if unscaled:
-                scaled = ScaleMeasurement(positions=data.positions, fixed=fixed_images(folder, found.views, None))
-            else:
-                scaled = measured
+            scaled = ScaleMeasurement(positions=data.positions) if unscaled else measured
+            scaled = replace(scaled, fixed=fixed_images(folder, found.views, None))
             lens = _lens_told(found, output)
             request = MapRequest(found.views, folder, scaled, how=how_of(), stated=data.stated, lens=lens)
             made = make_map(request, output, _progress)

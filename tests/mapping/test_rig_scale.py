@@ -14,8 +14,8 @@ from spherloc.mapping.make import scale_of
 from spherloc.mapping.photographs import photographs
 from spherloc.mapping.positions import Positions
 from spherloc.mapping.request import ScaleMeasurement
-from spherloc.mapping.rig_scale import FixedImages, fixed_images, scale_by_rig
-from spherloc.mapping.upright import Level
+from spherloc.mapping.rig_scale import FixedImages, doubt_of_scale, fixed_images, scale_by_rig
+from spherloc.mapping.upright import Level, MapScale
 from tests.datasets.asl_tree import euroc, transform, tum_vi
 
 METRES_PER_UNIT = 3.7
@@ -85,6 +85,16 @@ def test_its_uncertainty_is_that_of_the_errors(rng):
 def test_what_gives_no_scale_is_told(rng, given, sentence):
     with pytest.raises(InputError, match=f"rig.json, which says how .* gave no scale: .*{sentence}"):
         _ = Rig(rng, **given).scale
+
+
+def test_a_scale_that_was_given_is_doubted_if_the_rig_says_otherwise(rng):
+    """Such as one in centimetres; a tenth is no reason."""
+    rig = Rig(rng)
+    for times, said in ((1.0, ""), (1.1, ""), (100.0, "0.01")):
+        given = MapScale(times * METRES_PER_UNIT, "cameras 160 m above the ground")
+        doubt = doubt_of_scale(rig.poses, given, rig.fixed)
+        assert bool(doubt) == bool(said) and (not said or f"the map is {said} times as large" in doubt)
+    assert not doubt_of_scale({}, MapScale(1.0, "somehow"), rig.fixed)
 
 
 def test_images_that_are_not_in_the_map_do_not_count(rng):
