@@ -171,8 +171,8 @@ def doubt_of_scale(poses: Mapping[str, FloatArray], scale: MapScale, fixed: Fixe
     if max(times, 1.0 / times) <= ALIKE:
         return ""
     return (
-        f"whether the scale is right: by the distances of the cameras in {fixed.source} the map is {times:.2g} times as "
-        "large; one of the two is wrong or has another unit"
+        f"whether the scale is right: by the distances of the cameras in {fixed.source} the map is {times:.2g} times "
+        "as large; one of the two is wrong or has another unit"
     )
 
 
