@@ -131,7 +131,7 @@ def main() -> None:
         truth = written(folder)
         start = time.perf_counter()
         found = photographs(folder, {}, choice=FrameChoice(frames))
-        data, fixed = sequence_data(folder, found.views), fixed_images(folder, found.views, None)
+        data, (fixed, _) = sequence_data(folder, found.views), fixed_images(folder, found.views, None)
         assert fixed is not None
         print("\n".join([*found.remarks, *data.remarks]))
         measured = ScaleMeasurement(positions=data.positions)

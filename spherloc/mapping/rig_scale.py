@@ -24,7 +24,7 @@ from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.mapping.advice import advice
 from spherloc.mapping.lens import for_colmap
-from spherloc.mapping.photographs import CALIBRATIONS, MAX_CALIBRATIONS
+from spherloc.mapping.photographs import CALIBRATIONS, CALLED_CALIBRATION, MAX_CALIBRATIONS
 from spherloc.mapping.positions import MAX_SCALE_SD, NEAR_SD
 from spherloc.mapping.rig import TURNED_RAD, Key, camera_and_key, taken_together
 from spherloc.mapping.sequence import shots_of_sequence
@@ -57,8 +57,9 @@ class FixedImages:
     """Names of the images that were taken together, those of one camera first, by a number of their time."""
 
 
-def fixed_images(folder: Path, views: Sequence[View], file: Path | None) -> FixedImages | None:
-    """How the cameras of ``views``, photographs in ``folder``, are fixed to each other; None if no calibration says it.
+def fixed_images(folder: Path, views: Sequence[View], file: Path | None) -> tuple[FixedImages | None, list[str]]:
+    """How the cameras of ``views``, photographs in ``folder``, are fixed to each other, None if no calibration says it;
+    and remarks on what cannot be used.
 
     The calibration is ``file``, else that of a sequence in the ASL layout, else a file in ``folder``.
     """
@@ -69,16 +70,19 @@ def fixed_images(folder: Path, views: Sequence[View], file: Path | None) -> Fixe
             if shot.calibrated is not None and shot.calibrated.body_from_camera is not None:
                 placed[shot.name] = (shot.camera, shot.calibrated.body_from_camera)
                 files.add(sequence.called(shot.calibrated.file))
-        return _together(views, placed, " and ".join(sorted(files)))
+        return _together(views, placed, " and ".join(sorted(files))), []
+    remarks: list[str] = []
     names = [] if file is not None else [name for name in names_in(folder) if Path(name).suffix.lower() in CALIBRATIONS]
     for path in [folder / name for name in names[:MAX_CALIBRATIONS]] if file is None else [file]:
         try:
             rig = read_rig(path)
-        except CalibrationError:  # told where its cameras are read
+        except CalibrationError as error:  # beside the photographs may lie anything
+            if file is not None or CALLED_CALIBRATION.search(path.stem.lower()):
+                remarks.append(f"{error} It is not used for the scale.")
             continue
         if len(rig.body_from_camera) > 1 and (found := _together(views, _placed(path, rig, views), shorten(path.name))):
-            return found
-    return None
+            return found, remarks
+    return None, remarks
 
 
 def _placed(path: Path, rig: RigCalibration, views: Sequence[View]) -> dict[str, tuple[str, FloatArray]]:

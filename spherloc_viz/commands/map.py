@@ -144,7 +144,9 @@ def make(
                 say(f"{new_images}: {remark}")
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
         try:
-            fixed = fixed_images(folder, found.views, None if camera is None else camera[0])
+            fixed, about_rig = fixed_images(folder, found.views, None if camera is None else camera[0])
+            for remark in about_rig:
+                say(remark)
             scaled = replace(ScaleMeasurement(positions=data.positions) if unscaled else measured, fixed=fixed)
             told = _lens_told(found, target)
             request = MapRequest(found.views, folder, scaled, others, masks, how, find_carried, stated, told)
@@ -404,7 +406,8 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
             unscaled = measured == ScaleMeasurement()
             data = sequence_data(folder, found.views, positions=unscaled)
             scaled = ScaleMeasurement(positions=data.positions) if unscaled else measured
-            scaled = replace(scaled, fixed=fixed_images(folder, found.views, None))
+            fixed, about_rig = fixed_images(folder, found.views, None)
+            scaled = replace(scaled, fixed=fixed)
             lens = _lens_told(found, output)
             request = MapRequest(found.views, folder, scaled, how=how_of(), stated=data.stated, lens=lens)
             made = make_map(request, output, _progress)
@@ -417,7 +420,7 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
             _tell({"error": _unwritten(report, error)})
             return 1
         others = "other images  open their folder in the list: they can be localized in this map"
-        told = [*found.remarks, *data.remarks, *summary(made, found), f"report        {report}", others]
+        told = [*found.remarks, *data.remarks, *about_rig, *summary(made, found), f"report        {report}", others]
     _tell({"scene": str(made.written.scene), "report": str(report), "summary": told})
     return 0
 

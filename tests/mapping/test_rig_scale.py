@@ -110,7 +110,7 @@ def test_images_that_are_not_in_the_map_do_not_count(rng):
 def test_a_sequence_tells_how_its_cameras_are_fixed(tmp_path, rng, write, key):
     tree = write(tmp_path / "room", rng, **({"key": key} if key else {}))
     views = photographs(tree.folder, {}).views
-    fixed = fixed_images(tree.folder, views, None)
+    fixed, _ = fixed_images(tree.folder, views, None)
     assert len(fixed.times) == len(tree.times) and all(len(names) == 2 for names in fixed.times.values())
     assert ("camchain.yaml" if key else "mav0/cam0/sensor.yaml and mav0/cam1/sensor.yaml") in fixed.source
     poses = {}
@@ -141,31 +141,42 @@ def test_a_calibration_beside_images_or_given_tells_it(tmp_path):
     folder = written(tmp_path / "beside", 21)
     views = photographs(folder, {}).views
     for file in (None, folder / "rig.json"):
-        fixed = fixed_images(folder, views, file)
+        fixed, _ = fixed_images(folder, views, file)
         assert fixed.source == "rig.json" and len(fixed.times) == 4
         assert {name: body[0, 3] for name, body in fixed.body_from_camera.items()} == {
             f"{name}_{number}.png": at for name, at in (("left", 0.0), ("right", 0.2)) for number in range(4)
         }
     (folder / "rig.json").write_text(json.dumps({"left": LENS, "right": LENS}))
-    assert fixed_images(folder, views, None) is None
+    assert fixed_images(folder, views, None) == (None, [])
+
+
+def test_a_calibration_that_states_no_transform_is_told(tmp_path):
+    folder = written(tmp_path / "beside", 21)
+    views = photographs(folder, {}).views
+    (folder / "rig.json").write_text((folder / "rig.json").read_text().replace("0.2", "1e999"))
+    (folder / "calibration.json").write_text((folder / "rig.json").read_text())
+    fixed, remarks = fixed_images(folder, views, None)
+    assert fixed is None and len(remarks) == 1, "what is not called as calibrations are may be anything"
+    assert "calibration.json: right: " in remarks[0] and remarks[0].endswith("It is not used for the scale.")
+    assert len(fixed_images(folder, views, folder / "rig.json")[1]) == 1
 
 
 def test_images_that_were_scaled_are_known_too(tmp_path):
     folder = written(tmp_path / "half", 21, (32, 24))
     cameras, _ = given_cameras(folder / "rig.json", None, folder)
-    fixed = fixed_images(folder, photographs(folder, cameras).views, folder / "rig.json")
+    fixed, _ = fixed_images(folder, photographs(folder, cameras).views, folder / "rig.json")
     assert len(fixed.times) == 4
 
 
 def test_cameras_with_one_lens_are_told_apart_by_their_folders(tmp_path):
     """Else it is not known which took an image, and nothing is told."""
     folder = written(tmp_path / "same", 20)
-    assert fixed_images(folder, photographs(folder, {}).views, None) is None
+    assert fixed_images(folder, photographs(folder, {}).views, None) == (None, [])
     for name in ("left", "right"):
         (folder / name).mkdir()
         for path in folder.glob(f"{name}_*.png"):
             path.rename(folder / name / path.name.removeprefix(f"{name}_"))
-    fixed = fixed_images(folder, photographs(folder, {}).views, None)
+    fixed, _ = fixed_images(folder, photographs(folder, {}).views, None)
     assert fixed is not None and sorted(fixed.times[0]) == ["left/0.png", "right/0.png"]
 
 
