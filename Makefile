@@ -26,6 +26,8 @@ play: ## Install what it needs, start the playground and print its address
 	@scripts/setup.sh play
 	@trap : INT; $(BIN)/spherloc play '$(SCENE)' $(if $(PORT),--port $(PORT)) $(ARGS) || [ $$? -eq 130 ] # Ctrl-C is its end
 
+# Processes that share two cores wait for each other's threads of OpenBLAS.
+test: export OPENBLAS_NUM_THREADS = 1
 # Kernels are compiled before the tests begin, for each of their processes would compile all of them.
 test: ## Install what the tests need, a Chromium included, and run them all
 	@SPHERLOC_CHROMIUM="$$(scripts/setup.sh test)" && export SPHERLOC_CHROMIUM && \

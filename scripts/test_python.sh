@@ -8,6 +8,7 @@
 # them. Where nothing can be installed for it, it says so and ends well, as without a newer Python.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
+export OPENBLAS_NUM_THREADS=1
 
 versions=(3.13 3.12)
 tests=(

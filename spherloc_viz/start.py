@@ -17,6 +17,8 @@ def main() -> None:
     Ctrl-C ends it without a word as long as it has nothing to keep, while it is importing and after its work is done.
     """
     _fill_standard_streams()
+    # Where something else runs, threads of OpenBLAS wait for each other: a fit of a lens took six times as long.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     told = answer(sys.argv[1:])
     if told is not None:
         _print(told[0])

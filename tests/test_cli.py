@@ -344,6 +344,17 @@ def test_the_first_screen_names_every_command_and_fits() -> None:
     assert start("--version").stdout.strip() == f"spherloc {version('spherloc')}"
 
 
+def test_openblas_has_one_thread_unless_another_number_is_set() -> None:
+    """Before numpy is imported, which reads it once."""
+    program = "import os, sys\nfrom spherloc_viz.start import main\nassert 'numpy' not in sys.modules\n"
+    program += "try: main()\nfinally: print(os.environ['OPENBLAS_NUM_THREADS'])"
+    others = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    for given, threads in ({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3"):
+        words, environment = [sys.executable, "-c", program, "--version"], others | given
+        said = subprocess.run(words, env=environment, capture_output=True, text=True, cwd=ROOT, check=False).stdout
+        assert said.split()[-1] == threads, said
+
+
 def test_a_word_that_is_no_command_is_told_what_to_do(tmp_path: Path) -> None:
     assert answer(["play"]) is None and answer(["--unknown"]) is None
     for name in ("scene.toml", "run.rrd"):
