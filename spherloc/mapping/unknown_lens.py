@@ -69,8 +69,8 @@ def find_lens(paths: Sequence[Path], size: tuple[int, int], tell: Tell) -> Calib
         return CalibratedLens(
             camera,
             "There was no calibration, and pairs of the photographs do not tell the lens: lenses that differ by "
-            f"{np.degrees(off_rad):.1f}° fit them or halves of them. One of these "
-            "is tried, and the map must tell better.",
+            f"{np.degrees(off_rad):.1f}° fit them or halves of them. One of these is tried, and there is a map only if "
+            "that tells the lens better.",
             f"they do not tell their lens: lenses that differ by {np.degrees(off_rad):.1f}° fit them or halves of "
             "them, as where a camera only went straight ahead; add some that were taken with the camera turned",
         )
