@@ -406,7 +406,7 @@ class FoundCalibrations:
             f"The calibration beside them is not used ({', '.join(others[:MAX_NAMED])} pixels), as no photograph there"
         )
         turned = any((camera.height, camera.width) in sizes for camera in self.cameras.values())
-        what = "turn the photographs by 90°, or calibrate anew" if turned else "scale it to that of the photographs"
+        what = "turn the photographs by 90°, or calibrate anew" if turned else advice("another size")
         return [f"{told} has its size: {what}.", *self.refused[:MAX_NAMED]]
 
 

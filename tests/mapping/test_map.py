@@ -422,7 +422,7 @@ def test_the_calibration_beside_the_photographs_is_taken(tmp_path, rng):
         photographs(tmp_path, {}, find_lens=_no_lens)
     told = str(error.value)
     assert "have no calibration that can be used, and they show nothing." in told and "notes" not in told
-    assert "is not used (a is of 640 x 480 pixels), as no photograph there has its size" in told
+    assert "is not used (a is of 640 x 480 pixels), as no photograph there has its size: give it with --camera" in told
     assert "A file beside them is not used: " in told and "calibration.yaml" in told
 
 
