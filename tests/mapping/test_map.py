@@ -43,7 +43,7 @@ from spherloc.mapping.make import make_map, scale_of
 from spherloc.mapping.misplaced import far_off, without_misplaced
 from spherloc.mapping.new_images import NewImages, new_images_of
 from spherloc.mapping.new_queries import add_new_images, map_images
-from spherloc.mapping.photographs import Photographs, _is_in, photographs
+from spherloc.mapping.photographs import Photographs, is_called, photographs
 from spherloc.mapping.request import MapRequest, ScaleMeasurement
 from spherloc.mapping.scene_files import (
     MODEL,
@@ -496,7 +496,7 @@ def test_each_image_of_a_rig_has_its_camera(tmp_path, rng):
     # A number may be that of a picture, and cam1 is not cam10.
     numbers = photographs(flat, {"1": lens, "2": other})
     assert {view.camera.fx for view in numbers.views} == {90.0} and "Camera 1 is taken" in numbers.remarks[0]
-    assert not _is_in("cam1", "cam10_1.png") and _is_in("left", "left0001.png") and not _is_in("left", "leftover.png")
+    assert not is_called("cam1", "cam10_1.png") and is_called("left", "left0001.png") and not is_called("left", "leftover.png")
     picture(flat / "panorama.png", 400, 200, rng)
     (flat / "slam_left.toml").write_text(written(lens))
     (flat / "slam_right.toml").write_text(written(other))
