@@ -1,5 +1,6 @@
 """Makes a map from photographs and writes it to the disk: all steps in their order."""
 
+import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -7,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from spherloc.errors import InputError, SpherlocError, StoppedError, show
+from spherloc.files import lock
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.checked_models import checked_models
@@ -78,7 +80,8 @@ def make_map(request: MapRequest, folder: Path, tell: Tell = lambda *_: None) ->
 
     Raises ``InputError`` if the images give no map or do not tell their lens, if the measurement names other images, or
     if a file cannot be read: then nothing is left in ``folder`` but a map that was finished before. Raises
-    ``StoppedError`` if a file cannot be written: what is done is kept there and not done again.
+    ``StoppedError`` if a file cannot be written: what is done is kept there and not done again. Where another process
+    makes a map in ``folder``, that is left alone, and ``InputError`` is raised.
     """
     names, distance = {view.name for view in request.views}, request.measured.distance
     for name in () if distance is None else distance[:2]:
@@ -90,13 +93,40 @@ def make_map(request: MapRequest, folder: Path, tell: Tell = lambda *_: None) ->
 
 @contextmanager
 def _folder_of_map(folder: Path) -> Iterator[None]:
-    """Make the folder of a map. Nothing is left of a map that cannot be made; what can go on is kept."""
-    before = set(folder.glob(DATABASES))
+    """Make the folder of a map, and keep other processes out. Nothing is left of a map that cannot be made; what can go
+    on is kept."""
     made = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); {advice('other folder')}.") from None
+    with _locked(folder), _tidy(folder, made):
+        yield
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock a folder against other processes that make a map in it."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:  # Windows cannot open folders
+        yield
+        return
+    try:
+        try:
+            lock(handle)
+        except BlockingIOError:
+            busy = "another process is making a map there"
+            raise InputError(f"{folder}: {busy}; wait until it is done, or {advice('own folder')}.") from None
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def _tidy(folder: Path, made: bool) -> Iterator[None]:
+    """Leave nothing of a map that cannot be made in its folder, which was ``made`` for it or not."""
+    before = set(folder.glob(DATABASES))
     try:
         yield
     except StoppedError:

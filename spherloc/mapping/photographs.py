@@ -161,6 +161,8 @@ def with_cameras(
             calibrated |= {} if lens is None else {place.camera if place.inside else "": lens}
         except InputError as error:
             found, about = [], [f"It is left out: {error}"]
+        else:
+            about = [*about, *_about_another(found, given or beside.cameras, place.camera, folders)]
         views += found
         if len(cameras_of(found)) == 1:
             known[place.camera] = found[0].camera
@@ -218,6 +220,21 @@ def _belonging(cameras: Mapping[str, Camera], folder: str, folders: Sequence[str
         name = of_number[numbers[folder]]
         return {name: cameras[name]}
     return cameras
+
+
+def _about_another(
+    views: Sequence[View], cameras: Mapping[str, Camera], folder: str, folders: Sequence[str]
+) -> list[str]:
+    """That the images of a folder have the only camera of their size, but another folder is called as that camera."""
+    sizes = {(view.camera.width, view.camera.height) for view in views}
+    fitting = [name for name, camera in cameras.items() if (camera.width, camera.height) in sizes]
+    others = {name.lower() for name in folders if name.lower() != folder.lower()}
+    if len(fitting) != 1 or fitting[0].lower() not in others:
+        return []
+    return [
+        f"Camera {shorten(fitting[0])} is taken for its images, which have that size, but another folder is called so; "
+        "put the calibration of this one's camera beside them if it differs."
+    ]
 
 
 def _of_folder(
@@ -363,7 +380,7 @@ def _with_cameras(
         return dict.fromkeys(names, next(iter(fitting.values()))), []
     found = {}
     for name in names:
-        called = [camera for camera in fitting if _is_in(camera, name)]
+        called = [camera for camera in fitting if is_called(camera, name)]
         if called:
             found[name] = fitting[max(called, key=len)]
     if found:
@@ -374,7 +391,7 @@ def _with_cameras(
     return dict.fromkeys(names, fitting[first]), [f"{taken}, {choice}"]
 
 
-def _is_in(camera: str, image: str) -> bool:
+def is_called(camera: str, image: str) -> bool:
     """Whether the name of a camera is a part of an image's name; COLMAP's numbers of cameras are not looked for there,
     where a digit may mean anything."""
     if not camera or camera.isdigit():

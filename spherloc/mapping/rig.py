@@ -48,7 +48,10 @@ two fixed cameras are."""
 Shots = Mapping[str, tuple[str, int]]
 """By an image's name: its camera's name, and a number that all images taken together with it have."""
 
-_NUMBERS = re.compile(r"\d+(?:\.\d+)?")
+_NUMBERS = re.compile(r"\d{8}[_-]\d{6}(?:[_-]\d{3})?(?!\d)|\d+(?:\.\d+)?")
+"""Numbers in a name; a date and a time of day, perhaps with milliseconds, are one."""
+_CAMERA_NUMBER = re.compile(r"(?<![a-z])(?:camera|cam|fisheye|lens)[_-]?\d{1,2}$", re.IGNORECASE)
+"""How what precedes the end of a number ends if it tells the camera: ``frame3_cam1``."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class Key:
     """What orders the images of a camera, and tells which were taken together."""
 
     number: float
-    """A time in nanoseconds, or the longest number in a name; -1 without one."""
+    """A time in nanoseconds, or the longest number in a name but for that of its camera; -1 without one."""
     is_time: bool
 
 
@@ -131,17 +134,18 @@ def _nearest(steps: FloatArray, number: float) -> int:
 
 def camera_and_key(name: str, time_ns: int | None = None) -> tuple[str, Key]:
     """The camera that a name tells, its folder or what is left of it without its longest number, and that number or
-    the time that it is, if ``time_ns`` states no other."""
+    the time that it is, if ``time_ns`` states no other. The number of a camera is not taken if there is another one."""
     path = PurePosixPath(name)
     time_ns = time_in_name(name) if time_ns is None else time_ns
     numbers = list(_NUMBERS.finditer(path.stem))
-    longest = max(numbers, key=lambda number: (len(number[0]), number.start()), default=None)
+    others = [number for number in numbers if not _CAMERA_NUMBER.search(path.stem[: number.end()])]
+    longest = max(others or numbers, key=lambda number: (len(number[0]), number.start()), default=None)
     folder = "" if path.parent == PurePosixPath(".") else str(path.parent)
     if path.parent.name != (camera := camera_of_folder(path.parent)):
         folder = camera
     rest = path.stem if longest is None else path.stem[: longest.start()] + path.stem[longest.end() :]
-    number = -1.0 if longest is None else float(longest[0])
-    return folder or rest, Key(number if time_ns is None else float(time_ns), time_ns is not None)
+    number = -1.0 if longest is None else float(re.sub("[_-]", "", longest[0]))
+    return folder or rest.strip("_-. "), Key(number if time_ns is None else float(time_ns), time_ns is not None)
 
 
 def went_apart(poses: Mapping[str, FloatArray], shots: Shots) -> tuple[str, str] | None:

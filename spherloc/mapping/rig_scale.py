@@ -5,6 +5,7 @@ Images that were taken together stand to each other as their cameras do, so that
 is known in metres. A single distance is as inexact as the two poses; many of them are not.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -24,7 +25,7 @@ from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.mapping.advice import advice
 from spherloc.mapping.lens import for_colmap
-from spherloc.mapping.photographs import CALIBRATIONS, CALLED_CALIBRATION, MAX_CALIBRATIONS
+from spherloc.mapping.photographs import CALIBRATIONS, CALLED_CALIBRATION, MAX_CALIBRATIONS, is_called
 from spherloc.mapping.positions import MAX_SCALE_SD, NEAR_SD
 from spherloc.mapping.rig import TURNED_RAD, Key, camera_and_key, taken_together
 from spherloc.mapping.sequence import shots_of_sequence
@@ -35,6 +36,8 @@ MIN_TIMES = 3
 """Least number of times at which two cameras took images together."""
 MIN_BASELINE_M = 1e-3
 """Cameras that are closer do not tell a scale."""
+MAX_BASELINE_M = 20.0
+"""Cameras that are fixed to each other are not farther apart: such numbers are of other units."""
 PER_SD = 1.54
 """Median length of a vector of three normal numbers, in their standard deviations."""
 ALIKE = 1.2
@@ -54,12 +57,13 @@ class FixedImages:
     body_from_camera: Mapping[str, FloatArray]
     """(4, 4), metres, by the name of the image."""
     times: Mapping[int, Sequence[str]]
-    """Names of the images that were taken together, those of one camera first, by a number of their time."""
+    """Names of the images that were taken together, those of one camera first, by a number of their time; none if it is
+    not known which these are."""
 
 
 def fixed_images(folder: Path, views: Sequence[View], file: Path | None) -> tuple[FixedImages | None, list[str]]:
-    """How the cameras of ``views``, photographs in ``folder``, are fixed to each other, None if no calibration says it;
-    and remarks on what cannot be used.
+    """How the cameras of ``views``, photographs in ``folder``, are fixed to each other, None if no calibration says it
+    or if the images are of one camera; and remarks on what cannot be used.
 
     The calibration is ``file``, else that of a sequence in the ASL layout, else a file in ``folder``.
     """
@@ -87,7 +91,7 @@ def fixed_images(folder: Path, views: Sequence[View], file: Path | None) -> tupl
 
 def _placed(path: Path, rig: RigCalibration, views: Sequence[View]) -> dict[str, tuple[str, FloatArray]]:
     """The camera's name and ``body_from_camera`` (4, 4) of the images that have one of a file's cameras; where several
-    have the same lens, the one that is called as the image's folder."""
+    have the same lens, the one whose name is in that of the image or of its folder."""
     names: dict[str, list[str]] = {}
     for size in {(view.camera.width, view.camera.height) for view in views}:
         for name in rig.body_from_camera:
@@ -98,10 +102,28 @@ def _placed(path: Path, rig: RigCalibration, views: Sequence[View]) -> dict[str,
     for view in views:
         called = names.get(repr(view.camera), [])
         if len(called) > 1:
-            called = [name for name in called if name == camera_of_folder(Path(view.name).parent)]
+            called = sorted((name for name in called if _says(view.name, name)), key=len)[-1:]
         if len(called) == 1:
             found[view.name] = (called[0], rig.body_from_camera[called[0]])
-    return found
+    return {name: one for name, one in found.items() if name not in _of_several(found)}
+
+
+def _of_several(placed: Mapping[str, tuple[str, FloatArray]]) -> set[str]:
+    """Names of images that have the camera of images which, by their names, another camera took: at most one of the two
+    is that camera, the one that is called so."""
+    takers: dict[str, dict[str, list[str]]] = {}
+    for image, (camera, _) in placed.items():
+        takers.setdefault(camera, {}).setdefault(camera_and_key(image)[0], []).append(image)
+    wrong = set[str]()
+    for camera, images in takers.items():
+        if sum(len(names) >= MIN_TIMES for names in images.values()) > 1:
+            wrong |= {name for names in images.values() for name in names if not _says(name, camera)}
+    return wrong
+
+
+def _says(image: str, camera: str) -> bool:
+    """Whether the name of an image, or that of its folder, has that of a camera."""
+    return is_called(camera, image) or camera_of_folder(Path(image).parent) == camera
 
 
 def _for_images(path: Path, name: str, size: tuple[int, int]) -> Camera | None:
@@ -125,8 +147,16 @@ def _together(views: Sequence[View], placed: Mapping[str, tuple[str, FloatArray]
     for name, (_, step) in sorted(taken_together(keys, MIN_TIMES).items()):
         times.setdefault(step, []).append(name)
     times = {step: names for step, names in times.items() if len(names) > 1}
+    if not times and len(_takers(views)) < 2:
+        return None
     bodies = {name: placed[name][1] for names in times.values() for name in names}
-    return FixedImages(source, bodies, times) if times else None
+    return FixedImages(source, bodies, times)
+
+
+def _takers(views: Sequence[View]) -> set[str]:
+    """The cameras that took two images or more each, by their names."""
+    images = Counter(camera_and_key(view.name)[0] for view in views)
+    return {camera for camera, count in images.items() if count > 1}
 
 
 def scale_by_rig(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScale:
@@ -139,12 +169,19 @@ def scale_by_rig(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScal
     times = [names for names in times if len(names) > 1]
     none = f"{fixed.source}, which says how the cameras are fixed to each other, gave no scale"
     if len(times) < MIN_TIMES:
+        if len(fixed.times) < MIN_TIMES:
+            told = "as far as names of images and folders tell its cameras, and numbers or times in them the moment"
+            raise InputError(f"{none}: two cameras took images together at fewer than {MIN_TIMES} times, {told}.")
         raise InputError(f"{none}: at {len(times)} times images of two cameras are in the map, {MIN_TIMES} are needed.")
     pairs = [pair for names in times for pair in combinations(names, 2)]
     between = [_between(poses, fixed.body_from_camera, pair) for pair in pairs]
     stated, mapped = (np.array([one[k] for one in between]) for k in (0, 1))
     turned_rad = np.array([one[2] for one in between])
-    alike = (turned_rad <= TURNED_RAD) & (np.linalg.norm(stated, axis=1) > MIN_BASELINE_M)
+    lengths_m = np.linalg.norm(stated, axis=1)
+    if lengths_m.max() > MAX_BASELINE_M:
+        metres = "give the positions in its transforms in metres, not in millimetres"
+        raise InputError(f"{none}: it says that cameras are {lengths_m.max():.0f} m apart; {metres}.")
+    alike = (turned_rad <= TURNED_RAD) & (lengths_m > MIN_BASELINE_M)
     if 2 * np.count_nonzero(alike) < len(alike):
         off_deg = np.degrees(np.median(turned_rad))
         otherwise = f"in the map the cameras are turned against each other {off_deg:.0f}° otherwise than it says"

@@ -26,6 +26,7 @@ from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.query_gravity import read_gravity
 from spherloc.errors import CalibrationError, InputError
 from spherloc.estimators import estimate
+from spherloc.files import lock
 from spherloc.formats.colmap_files import read_model
 from spherloc.frontend import trained
 from spherloc.frontend.masks import Masks
@@ -43,7 +44,7 @@ from spherloc.mapping.make import make_map, scale_of
 from spherloc.mapping.misplaced import far_off, without_misplaced
 from spherloc.mapping.new_images import NewImages, new_images_of
 from spherloc.mapping.new_queries import add_new_images, map_images
-from spherloc.mapping.photographs import Photographs, _is_in, photographs
+from spherloc.mapping.photographs import Photographs, is_called, photographs
 from spherloc.mapping.request import MapRequest, ScaleMeasurement
 from spherloc.mapping.scene_files import (
     MODEL,
@@ -496,7 +497,11 @@ def test_each_image_of_a_rig_has_its_camera(tmp_path, rng):
     # A number may be that of a picture, and cam1 is not cam10.
     numbers = photographs(flat, {"1": lens, "2": other})
     assert {view.camera.fx for view in numbers.views} == {90.0} and "Camera 1 is taken" in numbers.remarks[0]
-    assert not _is_in("cam1", "cam10_1.png") and _is_in("left", "left0001.png") and not _is_in("left", "leftover.png")
+    assert (
+        not is_called("cam1", "cam10_1.png")
+        and is_called("left", "left0001.png")
+        and not is_called("left", "leftover.png")
+    )
     picture(flat / "panorama.png", 400, 200, rng)
     (flat / "slam_left.toml").write_text(written(lens))
     (flat / "slam_right.toml").write_text(written(other))
@@ -748,6 +753,24 @@ def test_a_map_that_cannot_be_made_leaves_what_was_there(tmp_path, rng):
     assert sorted(path.name for path in finished.iterdir()) == ["matches_0.db", "scene.toml"]
     assert [path.name for path in own.iterdir()] == ["notes.txt"]
     assert not stopped.exists()
+
+
+def test_a_folder_in_which_a_map_is_being_made_is_left_alone(tmp_path, rng):
+    for name in ("a.png", "b.png"):
+        picture(tmp_path / name, 400, 200, rng)
+    views, busy = photographs(tmp_path, {}).views, tmp_path / "map"
+    busy.mkdir()
+    (busy / "matches_0.db").write_text("of the other process")
+    handle = os.open(busy, os.O_RDONLY)
+    try:
+        lock(handle)  # as another process does
+        with pytest.raises(InputError, match=r"map: another process is making a map there; wait .* --output"):
+            make_map(MapRequest(views, tmp_path), busy)
+        assert (busy / "matches_0.db").exists()
+    finally:
+        os.close(handle)
+    with pytest.raises(InputError, match="no two of the 2 photographs"):
+        make_map(MapRequest(views, tmp_path), busy)
 
 
 def test_a_stopped_map_goes_on(tmp_path, rng):

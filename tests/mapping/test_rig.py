@@ -75,6 +75,10 @@ def in_another_frame(poses: dict[str, np.ndarray], scale: float, turn: np.ndarra
         ("left/{:03d}.png", "right/{:03d}.png"),
         ("cam0_{:04d}.jpg", "cam1_{:04d}.jpg"),
         ("{:04d}_left.jpg", "{:04d}_right.jpg"),
+        ("frame{}_cam0.jpg", "frame{}_cam1.jpg"),
+        ("camera-10_{}.jpg", "camera-12_{}.jpg"),
+        ("20240105_1230{:02d}_cam0.jpg", "20240105_1230{:02d}_cam1.jpg"),
+        ("cam0_20240105-1230{:02d}-250.jpg", "cam1_20240105-1230{:02d}-251.jpg"),  # 1 ms later
         ("slam-left_8755117091{:04d}00.png", "slam-right_8755117091{:04d}12.png"),  # 12 ns later
         ("a/17000000{:02d}.100000000.png", "b/17000000{:02d}.200000000.png"),
     ],

@@ -74,7 +74,7 @@ def test_its_uncertainty_is_that_of_the_errors(rng):
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        ({"times": 2}, "at 2 times images of two cameras are in the map, 3 are needed"),
+        ({"times": 2}, "two cameras took images together at fewer than 3 times"),
         (
             {"noise_m": 0.5},
             r"by images that cameras .* m apart took together, at 12 times, the scale is (uncertain|not)",
@@ -168,16 +168,61 @@ def test_images_that_were_scaled_are_known_too(tmp_path):
     assert len(fixed.times) == 4
 
 
-def test_cameras_with_one_lens_are_told_apart_by_their_folders(tmp_path):
-    """Else it is not known which took an image, and nothing is told."""
-    folder = written(tmp_path / "same", 20)
-    assert fixed_images(folder, photographs(folder, {}).views, None) == (None, [])
-    for name in ("left", "right"):
-        (folder / name).mkdir()
+def in_folders(folder, names):
+    """The images of ``left_1.png`` and so on, in a folder for each camera, of these names."""
+    for name, called in names.items():
+        (folder / called).mkdir()
         for path in folder.glob(f"{name}_*.png"):
-            path.rename(folder / name / path.name.removeprefix(f"{name}_"))
+            path.rename(folder / called / path.name.removeprefix(f"{name}_"))
+    return photographs(folder, {})
+
+
+def test_cameras_with_one_lens_are_told_apart_by_names(tmp_path):
+    """Else it is not known which took an image, which is told."""
+    folder = written(tmp_path / "same", 20)
     fixed, _ = fixed_images(folder, photographs(folder, {}).views, None)
-    assert fixed is not None and sorted(fixed.times[0]) == ["left/0.png", "right/0.png"]
+    assert [sorted(names) for names in fixed.times.values()] == [[f"left_{k}.png", f"right_{k}.png"] for k in range(4)]
+    fixed, _ = fixed_images(folder, in_folders(folder, {"left": "left", "right": "right"}).views, None)
+    assert sorted(fixed.times[0]) == ["left/0.png", "right/0.png"]
+    folder = written(tmp_path / "others", 20)
+    fixed, _ = fixed_images(folder, in_folders(folder, {"left": "a", "right": "b"}).views, None)
+    with pytest.raises(InputError, match=r"fewer than 3 times, as far as names .* tell its cameras"):
+        scale_by_rig({}, fixed)
+
+
+def test_a_camera_without_a_calibration_is_not_taken_for_another(tmp_path):
+    """Its images have the lens of a camera of their size, which is told, but do not stand where that one is."""
+    folder = written(tmp_path / "lacks", 21)
+    table = json.loads((folder / "rig.json").read_text())
+    table["rear"] = table.pop("right") | {"width": 32, "height": 24}
+    (folder / "rig.json").write_text(json.dumps(table))
+    for number in range(4):
+        cv2.imwrite(str(folder / f"rear_{number}.png"), np.zeros((24, 32), np.uint8))
+    found = in_folders(folder, {"left": "left", "right": "right", "rear": "rear"})
+    assert [remark for remark in found.remarks if "another folder is called so" in remark] == [
+        "right: Camera left is taken for its images, which have that size, but another folder is called so; put the "
+        "calibration of this one's camera beside them if it differs."
+    ]
+    fixed, _ = fixed_images(folder, found.views, None)
+    assert [sorted(names) for names in fixed.times.values()] == [[f"left/{k}.png", f"rear/{k}.png"] for k in range(4)]
+
+
+def test_images_of_other_times_are_told_to_give_no_scale(tmp_path):
+    folder = written(tmp_path / "apart", 21)
+    for number in range(4):
+        (folder / f"right_{number}.png").rename(folder / f"right_{10 + number}.png")
+    with pytest.raises(InputError, match=r"fewer than 3 times, .* numbers or times in them"):
+        scale_by_rig({}, fixed_images(folder, photographs(folder, {}).views, None)[0])
+    for path in folder.glob("right_*.png"):
+        path.unlink()
+    assert fixed_images(folder, photographs(folder, {}).views, None) == (None, [])  # of one camera
+
+
+def test_millimetres_are_not_taken_for_metres(rng):
+    rig = Rig(rng)
+    bodies = {name: transform(body[:3, :3], 1000.0 * body[:3, 3]) for name, body in rig.fixed.body_from_camera.items()}
+    with pytest.raises(InputError, match=r"rig.json, .* cameras are \d{2,3} m apart; give .* not in millimetres"):
+        scale_by_rig(rig.poses, FixedImages("rig.json", bodies, rig.fixed.times))
 
 
 def test_it_is_used_where_positions_give_no_scale(rng):
