@@ -450,15 +450,22 @@ def _scalar(value: Any) -> float:
 
 
 def _matrix(value: Any, count: int | None) -> list[float]:
-    """The numbers of a table ``rows``, ``cols``, ``data``, row by row; ``count`` is how many there must be."""
+    """The numbers of a table ``rows``, ``cols``, ``data`` or ``sizes``, ``data``, row by row; ``count`` is how many
+    there must be."""
     table = table_of(value)
-    rows, columns = numbers_of(table, "rows", "cols")
-    data = value_of(table, "data")
-    numbers = [] if isinstance(data, list) and not data else list_of(table, "data", _names(data))
-    if len(numbers) != rows * columns or (count is not None and len(numbers) != count):
+    sizes = list(_numbers(table, "sizes")) if "sizes" in table else numbers_of(table, "rows", "cols")
+    numbers = _numbers(table, "data")
+    if len(numbers) != np.prod(sizes) or (count is not None and len(numbers) != count):
         wanted = f"{count}" if count is not None else "rows x cols"
+        rows, columns, *_ = *sizes, 1.0
         raise CalibrationError(f"has {len(numbers)} numbers in {rows:g} rows and {columns:g} columns: give {wanted}.")
     return np.array(numbers, dtype=np.float64).tolist()
+
+
+def _numbers(table: dict[Any, Any], key: str) -> tuple[float, ...]:
+    """The finite numbers in the list under ``key``, which may be empty."""
+    values = value_of(table, key)
+    return () if isinstance(values, list) and not values else list_of(table, key, _names(values))
 
 
 def _names(data: Any) -> str:
