@@ -31,7 +31,7 @@ from spherloc.cameras.eucm import Eucm
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.cameras.ocam import Ocam
-from spherloc.errors import CalibrationError, show
+from spherloc.errors import CalibrationError, shorten, show
 from spherloc.types import FloatArray
 
 STELLA_PREFIX = "Camera."
@@ -413,6 +413,15 @@ def opencv(document: dict[Any, Any], of_images: tuple[int, int] | None = None) -
     if _is_fisheye(document, lens):
         return KannalaBrandt(*size, fx, fy, *middle, _four(lens, "k1, k2, k3, k4"))
     return Mei(*size, fx, fy, *middle, 0.0, _four(lens, "k1, k2, p1, p2"))
+
+
+def opencv_arrays(document: Any) -> list[str]:
+    """Names of the first arrays of OpenCV's FileStorage in a document."""
+    tables = (
+        {key: value for key, value in document.items() if isinstance(value, dict)} if isinstance(document, dict) else {}
+    )
+    arrays = [key for key, table in tables.items() if "data" in table and table.keys() & {"rows", "sizes"}]
+    return [shorten(str(key)) for key in arrays[:4]]
 
 
 def _is_fisheye(document: dict[Any, Any], lens: list[float]) -> bool:

@@ -95,6 +95,25 @@ def test_arrays_of_one_dimension_are_read(tmp_path, kind):
         load_camera(path)
 
 
+@pytest.mark.parametrize("kind", FLAT)
+def test_arrays_of_other_names_are_told(tmp_path, kind):
+    """Such as those of a pair of cameras, which OpenCV's stereo sample writes."""
+    path = tmp_path / f"intrinsics.{kind}"
+    text = FLAT[kind]
+    for old, new in (
+        ("K: ", "M1: "),
+        ("D: ", "D1: "),
+        ('"K"', '"M1"'),
+        ('"D"', '"D1"'),
+        ("<K ", "<M1 "),
+        ("<D ", "<D1 "),
+    ):
+        text = text.replace(old, new)
+    path.write_text(text.replace("</K>", "</M1>").replace("</D>", "</D1>"))
+    with pytest.raises(CalibrationError, match="has arrays of OpenCV by the names M1, D1: call those of one camera"):
+        load_camera(path)
+
+
 def test_the_keys_of_opencv_2(tmp_path):
     path = written(tmp_path, RADIAL, "xml", distortion_model="plumb_bob")
     wanted = load_camera(path)
