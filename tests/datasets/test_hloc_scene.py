@@ -238,7 +238,7 @@ def test_missing_files_are_named(world, rng, name):
 STELLA = """
 kind = "hloc"
 name = "panorama pair"
-model = "{data}/colmap_equirect/0"
+model = "{model}"
 images = "{data}"
 queries = "queries.txt"
 truth = "truth.txt"
@@ -262,7 +262,13 @@ def test_own_matching_of_real_panoramas(tmp_path, rng, more):
     with h5py.File(tmp_path / "global.h5", "w") as file:
         for name in (query, reference):
             file[f"{name}/global_descriptor"] = rng.normal(size=16).astype(np.float16)
-    (tmp_path / "scene.toml").write_text(STELLA.format(data=data, more=more))
+    # The model has the query by another name, whose image is not there: it is no query of its own map.
+    model = tmp_path / "model"
+    model.mkdir()
+    for file in ("cameras.txt", "images.txt", "points3D.txt"):
+        text = (data / "colmap_equirect" / "0" / file).read_text()
+        (model / file).write_text(text.replace(query, "absent.jpg"))
+    (tmp_path / "scene.toml").write_text(STELLA.format(data=data, model=model, more=more))
     scene = load_scene(tmp_path / "scene.toml")
     problem = scene.problem()
     assert problem.reference_images == (data / reference,)

@@ -214,7 +214,6 @@ def test_limits_are_not_included_and_both_count(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("drawn")
-@pytest.mark.usefixtures("drawn")
 def test_success_is_told_of_each_folder_too(tmp_path: Path) -> None:
     """Folders are cameras, or times of day: their success rates are published apart."""
     scene = replace(scene_of(tmp_path), thresholds=((1.0, 0.1), (2.0, 0.25)))
@@ -236,6 +235,7 @@ def test_success_is_told_of_each_folder_too(tmp_path: Path) -> None:
     assert "    day: " not in sequence_text(alone, summarize(alone), scene)
 
 
+@pytest.mark.usefixtures("drawn")
 def test_one_estimator_initialises_and_the_other_tracks(tmp_path: Path) -> None:
     """The initialiser solves the first query, one that is not localized, and the one after; its time counts."""
     scene = scene_of(tmp_path, queries=6, wrong=[2])
