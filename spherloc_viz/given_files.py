@@ -56,6 +56,12 @@ def known_as(path: Path) -> str:
     return known_as(path)
 
 
+def no_such_name(name: str, error: InputError) -> InputError:
+    """The ``error`` about a name that is not known, or, if it is the path of something, what that is."""
+    told = known_as(Path(name))
+    return InputError(told) if told else error
+
+
 def _may_have_recordings(folder: Path) -> bool:
     """Whether a folder, or one in it or in that, has recordings or a folder of that name, where results have them."""
     names = names_in(folder)

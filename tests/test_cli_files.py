@@ -85,7 +85,7 @@ def test_a_missing_file_is_said_before_anything_large_is_imported(words: list[st
 @pytest.mark.parametrize(
     "words",
     [["map"], ["view"], ["repeat"], ["label"], ["runs"], ["reindex"], ["rerun"], ["steps", "step = 1"], ["run"],
-     ["diagnose"], ["check-proof"]],
+     ["diagnose"], ["check-proof"], ["scenes"], ["lesson"], ["gallery"]],
     ids=lambda words: words[0],
 )  # fmt: skip
 def test_every_command_says_what_another_file_or_folder_is(words: list[str], tmp_path: Path) -> None:

@@ -42,8 +42,12 @@ class _Loader(yaml.SafeLoader):
         """Leave ``<<`` as it is; it is then refused like any unknown tag."""
 
 
-# OpenCV's FileStorage: a table of rows, cols, dt and data, which is read as a plain table.
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)
+OPENCV_TYPES = ("opencv-matrix", "opencv-nd-matrix")
+"""What OpenCV's FileStorage calls its tables of rows, cols, dt and data, and of sizes, dt and data, as OpenCV 5 writes
+arrays of one dimension."""
+
+for _type in OPENCV_TYPES:  # read as plain tables
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_type}", yaml.SafeLoader.construct_yaml_map)
 
 
 def read_text(path: Path) -> str:
@@ -141,12 +145,12 @@ def parse_opencv_xml(text: str) -> dict[str, Any]:
 
 
 def _opencv_value(node: ElementTree.Element) -> Any:
-    """A matrix as a table of rows, cols, dt and data, and of any other node the number or the text."""
-    if node.get("type_id") != "opencv-matrix":
+    """An array as a table of rows and cols or sizes, dt and data, and of any other node the number or the text."""
+    if node.get("type_id") not in OPENCV_TYPES:
         words = (node.text or "").strip().strip('"')
         return int(words) if words.isascii() and words.isdigit() and len(words) < 10 else words
     table: dict[str, Any] = {str(part.tag): (part.text or "").strip() for part in node}
-    return table | {"data": table.get("data", "").split()}
+    return table | {key: table[key].split() for key in ("sizes", "data") if key in table}
 
 
 def table_of(value: Any) -> dict[Any, Any]:

@@ -160,6 +160,11 @@ def _one_camera(document: Any, name: str | None, kind: str, size: tuple[int, int
         if mark in keys:
             _refuse_name(name)
             return opencv(document, size) if read is opencv else read(document)
+    if arrays := tool_files.opencv_arrays(document):
+        raise UnrecognisedError(
+            f"has arrays of OpenCV by the names {', '.join(arrays)}: call those of one camera camera_matrix and "
+            "distortion_coefficients, or K and D."
+        )
     raise UnrecognisedError(f"this {kind} has no known key at its top: {KNOWN}.")
 
 

@@ -31,7 +31,7 @@ from spherloc.cameras.eucm import Eucm
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.cameras.ocam import Ocam
-from spherloc.errors import CalibrationError, show
+from spherloc.errors import CalibrationError, shorten, show
 from spherloc.types import FloatArray
 
 STELLA_PREFIX = "Camera."
@@ -415,6 +415,15 @@ def opencv(document: dict[Any, Any], of_images: tuple[int, int] | None = None) -
     return Mei(*size, fx, fy, *middle, 0.0, _four(lens, "k1, k2, p1, p2"))
 
 
+def opencv_arrays(document: Any) -> list[str]:
+    """Names of the first arrays of OpenCV's FileStorage in a document."""
+    tables = (
+        {key: value for key, value in document.items() if isinstance(value, dict)} if isinstance(document, dict) else {}
+    )
+    arrays = [key for key, table in tables.items() if "data" in table and table.keys() & {"rows", "sizes"}]
+    return [shorten(str(key)) for key in arrays[:4]]
+
+
 def _is_fisheye(document: dict[Any, Any], lens: list[float]) -> bool:
     model = document.get("distortion_model")
     if isinstance(model, str) and model in _FISHEYE | _RADIAL:
@@ -450,15 +459,22 @@ def _scalar(value: Any) -> float:
 
 
 def _matrix(value: Any, count: int | None) -> list[float]:
-    """The numbers of a table ``rows``, ``cols``, ``data``, row by row; ``count`` is how many there must be."""
+    """The numbers of a table ``rows``, ``cols``, ``data`` or ``sizes``, ``data``, row by row; ``count`` is how many
+    there must be."""
     table = table_of(value)
-    rows, columns = numbers_of(table, "rows", "cols")
-    data = value_of(table, "data")
-    numbers = [] if isinstance(data, list) and not data else list_of(table, "data", _names(data))
-    if len(numbers) != rows * columns or (count is not None and len(numbers) != count):
+    sizes = list(_numbers(table, "sizes")) if "sizes" in table else numbers_of(table, "rows", "cols")
+    numbers = _numbers(table, "data")
+    if len(numbers) != np.prod(sizes) or (count is not None and len(numbers) != count):
         wanted = f"{count}" if count is not None else "rows x cols"
+        rows, columns, *_ = *sizes, 1.0
         raise CalibrationError(f"has {len(numbers)} numbers in {rows:g} rows and {columns:g} columns: give {wanted}.")
     return np.array(numbers, dtype=np.float64).tolist()
+
+
+def _numbers(table: dict[Any, Any], key: str) -> tuple[float, ...]:
+    """The finite numbers in the list under ``key``, which may be empty."""
+    values = value_of(table, key)
+    return () if isinstance(values, list) and not values else list_of(table, key, _names(values))
 
 
 def _names(data: Any) -> str:

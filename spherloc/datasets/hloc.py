@@ -3,7 +3,8 @@
 Without ``features`` and ``matches``, the project detects and matches its own features as [frontend] says: in the pairs,
 or with the references that ``global_features = "outputs/global-feats.h5"`` retrieves, or with those that the project
 retrieves by itself. hloc's models keep the order of the keypoints: the i-th in features.h5 is the i-th of the model's
-image.
+image. A query that is an image of the model is no reference, and points that only it and one reference saw are left
+out, as for ``kind = "colmap"``.
 
 P.-E. Sarlin, C. Cadena, R. Siegwart, M. Dymczyk: From Coarse to Fine: Robust Hierarchical Localization at Large Scale,
 CVPR 2019.
@@ -18,7 +19,15 @@ import numpy as np
 
 from spherloc.cameras.base import Camera
 from spherloc.datasets import map_scene, scene_file
-from spherloc.datasets.colmap import assumed_units, gravity_of_map, model_views, read_map, some, split_gravity
+from spherloc.datasets.colmap import (
+    assumed_units,
+    gravity_of_map,
+    model_views,
+    read_map,
+    some,
+    split_gravity,
+    without_queries,
+)
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, shorten, show
 from spherloc.files import is_file
@@ -216,9 +225,9 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     settings = map_scene.read_settings(table | {"gravity": shared_gravity}, where, GRAVITY_BOUND_DEG)
     images = map_scene.folder(table, "images", path)
     model = read_map(map_scene.folder(table, "model", path))
-    references, remarks = model_views(model, images)
-    down, assumed = gravity_of_map(gravity, references, where)
     cameras, skipped = read_queries(_file(table, "queries", path))
+    model, references, remarks = _map(model, images, cameras, where)
+    down, assumed = gravity_of_map(gravity, references, where)
     truth, unknown = _truth(_file(table, "truth", path), cameras) if "truth" in table else ({}, [])
     queries, missing = _queries(cameras, images, truth)
     pairs, unpaired = _pairs(table, path, queries, references)
@@ -228,6 +237,26 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     named = [key for key in ("features", "matches", "pairs", "global_features") if key in table]
     others["matched_files"] = tuple(_file(table, key, path) for key in named)
     return settings.scene(path, queries, references, down, said, **others)
+
+
+def _map(
+    model: ColmapModel, images: Path, queries: Mapping[str, Camera], where: str
+) -> tuple[ColmapModel, list[View], list[str]]:
+    """The model and its views, without the queries that are images of it, and remarks.
+
+    Raises ``InputError`` if no image or no point stays.
+    """
+    both = [name for name in model.images if name in queries]
+    if not both:
+        return model, *model_views(model, images)
+    if len(both) == len(model.images):
+        raise InputError(
+            f"{where}: all images of the model are queries; list fewer queries, or add images to the model."
+        )
+    model, left_out = without_queries(model, both, where)
+    views, remarks = model_views(model, images)
+    said = f"Queries that are in the model, too: {some(both, 'image')}, not used as references."
+    return model, [view for view in views if view.name not in queries], [*remarks, said, *left_out]
 
 
 def _check_combination(table: Mapping[str, Any], where: str) -> None:

@@ -18,7 +18,8 @@ SOURCE = "pitch and roll in the photograph's tags"
 MAX_BYTES = 1_000_000
 _GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
 _PITCH, _ROLL = "PosePitchDegrees", "PoseRollDegrees"
-_LIMITS_DEG = {_PITCH: 90.0, _ROLL: 180.0}
+_LIMITS_DEG = {_PITCH: 90.0, _ROLL: 360.0}
+"""Largest absolute values; of roll, 355 degrees are -5."""
 
 
 def gravity_from_tags(view: View, near: FloatArray | None = None) -> Gravity:
@@ -76,6 +77,7 @@ def says_full_panorama(path: Path) -> bool:
 
 def _parsed(packet: bytes) -> ElementTree.Element | None:
     """The root of an XMP packet; None if it is damaged."""
+    packet = packet.rstrip(b"\0")  # some programs end or pad it so
     # Declarations could define entities that grow without end or name other files; XMP has none.
     if len(packet) > MAX_BYTES or b"<!" in packet or b"\0" in packet:
         return None

@@ -6,6 +6,7 @@ from spherloc.datasets import bundled_scenes
 from spherloc.datasets.scene_file import SceneKind, read_table, scene_kind, scene_kinds
 from spherloc.errors import InputError
 from spherloc.registry import extension_of
+from spherloc_viz.given_files import no_such_name
 
 PROBLEMS = ("correspondences", "synthetic")
 """Kinds of scenes that are one problem, not made of images."""
@@ -30,7 +31,10 @@ def write_lesson(name: str, export: Path | None, handout: Path | None) -> int:
     """
     from spherloc_viz.lessons import lesson_named
 
-    lesson = lesson_named(name)
+    try:
+        lesson = lesson_named(name)
+    except InputError as error:
+        raise no_such_name(name, error) from None
     if export is None and handout is None:
         print(f"{lesson.title}\n{lesson.summary}\nspherloc play, then /learn/{lesson.name}; or --export, --handout.")
         return 0
@@ -70,7 +74,10 @@ def all_scenes() -> str:
 def one_kind(name: str) -> str:
     """An example of a kind, the packages it needs, and its bundled scenes. Raises ``InputError`` for an unknown
     kind."""
-    kind = scene_kind(name)
+    try:
+        kind = scene_kind(name)
+    except InputError as error:
+        raise no_such_name(name, error) from None
     if kind.problem:
         raise InputError(f"scenes of kind {name} cannot be read: {kind.problem}")
     parts = [_plain(kind.documentation)]

@@ -9,7 +9,7 @@ from spherloc.errors import shorten
 from spherloc.experiments.configuration import Configuration
 from spherloc.experiments.results import LOCALIZED, PICTURE, POSED, UNREADABLE, QueryResult, SequenceResults
 from spherloc.experiments.sequence import INITIALISED
-from spherloc.experiments.summary import SuccessRate, Summary, TrajectoryError, timed
+from spherloc.experiments.summary import SuccessRate, Summary, TrajectoryError, success_rates, timed
 from spherloc.frontend.gravity_from_lines import why_not_found
 from spherloc.frontend.pipeline import NO_POINT
 from spherloc.mapping.joint_outcome import TRIED, tried_anew
@@ -40,6 +40,7 @@ def sequence_text(results: SequenceResults, summary: Summary, scene: MapScene) -
     lines += [f"  {line}" for line in _wrong(results)]
     rates = (*summary.success, *summary.registration_success)
     lines += [f"  success {_rate(rate, setting.unit)}" for rate in rates if rate.judged or not summary.without_truth]
+    lines += [f"  {line}" for line in _by_folder(results)]
     if summary.median_rotation_error_deg is not None and summary.median_translation_error_m is not None:
         lines.append(
             f"  median error {summary.median_rotation_error_deg:.3f} deg and "
@@ -203,6 +204,23 @@ def _rate(rate: SuccessRate, unit: str) -> str:
         return f"{what}{limits}: nothing to judge"
     interval = f"{100 * rate.low:.1f} to {100 * rate.high:.1f} %"
     return f"{what}{limits}: {100 * rate.rate:.1f} % ({rate.successes} of {rate.judged}; 95 %: {interval})"
+
+
+def _by_folder(results: SequenceResults) -> Iterator[str]:
+    """A line for each folder of the queries with known truth, where there are several: those of one camera or one time
+    of day. It has the success rates at the limits of the scene, in their order."""
+    folders: dict[str, list[QueryResult]] = {}
+    for row in results.rows:
+        folders.setdefault(row.query.rpartition("/")[0], []).append(row)
+    rates = {name: success_rates(rows, results.configuration.thresholds) for name, rows in folders.items()}
+    judged = {name: told for name, told in rates.items() if told}
+    if len(judged) < 2:
+        return
+    for name, told in list(judged.items())[:MAX_EACH]:
+        cells = " / ".join(f"{100 * (rate.rate or 0.0):.1f}" for rate in told)
+        yield f"  {shorten(name) or 'without a folder'}: {cells} % of {told[0].judged}"
+    if len(judged) > MAX_EACH:
+        yield f"  and {len(judged) - MAX_EACH} more folders, see results.csv"
 
 
 def _skipped(summary: Summary) -> Iterator[str]:

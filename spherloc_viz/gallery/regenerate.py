@@ -13,6 +13,7 @@ from spherloc.metrics import evaluate
 from spherloc.trace import Trace
 from spherloc.warm_up import warm_up
 from spherloc_viz.gallery.case import Beside, GalleryCase, Played, faults, origin_of, play
+from spherloc_viz.given_files import no_such_name
 from spherloc_viz.recording.content.writer import write_recording
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.review_file import write_review
@@ -28,7 +29,8 @@ def chosen(cases: Sequence[GalleryCase], keys: Sequence[str]) -> tuple[GalleryCa
     by_key = {case.key: case for case in cases}
     for key in keys:
         if key not in by_key:
-            raise InputError(f"no case {show(key)} in the gallery; there are {', '.join(by_key)}.")
+            error = InputError(f"no case {show(key)} in the gallery; there are {', '.join(by_key)}.")
+            raise no_such_name(key, error)
     return tuple(by_key[key] for key in keys) or tuple(cases)
 
 

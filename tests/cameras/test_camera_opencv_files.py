@@ -53,6 +53,67 @@ def test_other_forms_of_a_file_hold_the_same(tmp_path, kind):
         assert load_camera(written(tmp_path, lens, kind, **others)) == load_camera(written(tmp_path, lens, **others))
 
 
+FLAT = {
+    "yml": """%YAML 1.2
+---
+image_width: 640
+image_height: 480
+fisheye_model: 1
+K: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 401.5, 0., 318.25, 0., 402.5, 239.75, 0., 0., 1. ]
+D: !!opencv-nd-matrix
+   sizes: [ 4 ]
+   dt: d
+   data: [ 0.02, -0.01, 0.003, -0.0005 ]
+""",
+    "xml": """<?xml version="1.0"?>
+<opencv_storage><image_width>640</image_width><image_height>480</image_height><fisheye_model>1</fisheye_model>
+<K type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
+  <data>401.5 0. 318.25 0. 402.5 239.75 0. 0. 1.</data></K>
+<D type_id="opencv-nd-matrix"><sizes>4</sizes><dt>d</dt><data>0.02 -0.01 0.003 -0.0005</data></D></opencv_storage>
+""",
+    "json": """{"image_width": 640, "image_height": 480, "fisheye_model": 1,
+"K": {"type_id": "opencv-matrix", "rows": 3, "cols": 3, "data": [401.5, 0, 318.25, 0, 402.5, 239.75, 0, 0, 1]},
+"D": {"type_id": "opencv-nd-matrix", "sizes": [4], "dt": "d", "data": [0.02, -0.01, 0.003, -0.0005]}}
+""",
+}
+"""D as OpenCV 5 writes arrays of one dimension."""
+
+
+@pytest.mark.parametrize("kind", FLAT)
+def test_arrays_of_one_dimension_are_read(tmp_path, kind):
+    path = tmp_path / f"flat.{kind}"
+    path.write_text(FLAT[kind])
+    assert load_camera(path) == load_camera(written(tmp_path, FISHEYE, fisheye_model=1))
+    path.write_text(
+        FLAT[kind].replace("sizes: [ 4 ]", "sizes: [ 5 ]").replace("<sizes>4", "<sizes>5").replace("[4]", "[5]")
+    )
+    with pytest.raises(CalibrationError, match="D: has 4 numbers in 5 rows and 1 columns"):
+        load_camera(path)
+
+
+@pytest.mark.parametrize("kind", FLAT)
+def test_arrays_of_other_names_are_told(tmp_path, kind):
+    """Such as those of a pair of cameras, which OpenCV's stereo sample writes."""
+    path = tmp_path / f"intrinsics.{kind}"
+    text = FLAT[kind]
+    for old, new in (
+        ("K: ", "M1: "),
+        ("D: ", "D1: "),
+        ('"K"', '"M1"'),
+        ('"D"', '"D1"'),
+        ("<K ", "<M1 "),
+        ("<D ", "<D1 "),
+    ):
+        text = text.replace(old, new)
+    path.write_text(text.replace("</K>", "</M1>").replace("</D>", "</D1>"))
+    with pytest.raises(CalibrationError, match="has arrays of OpenCV by the names M1, D1: call those of one camera"):
+        load_camera(path)
+
+
 def test_the_keys_of_opencv_2(tmp_path):
     path = written(tmp_path, RADIAL, "xml", distortion_model="plumb_bob")
     wanted = load_camera(path)

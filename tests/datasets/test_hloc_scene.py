@@ -5,7 +5,17 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from hloc_samples import QUERY, REFERENCES, SCENE, make_world, matches_of, write_all, write_features, write_text
+from hloc_samples import (
+    FISHEYE,
+    QUERY,
+    REFERENCES,
+    SCENE,
+    make_world,
+    matches_of,
+    write_all,
+    write_features,
+    write_text,
+)
 
 from spherloc.datasets import hloc, load_scene
 from spherloc.errors import InputError
@@ -125,6 +135,35 @@ def test_pairs_that_were_not_matched(world, rng):
     assert found.remarks[0].startswith(f"1 of 2 pairs of {QUERY} are not in ")
 
 
+def test_a_query_that_is_an_image_of_the_model_is_no_reference(world, rng):
+    """Nor is it matched with points that only it and one reference saw: they fit its true pose by their making."""
+    query, first, second = REFERENCES
+    world.point_of[second][world.point_of[second] % 3 == 0] = -1
+    write_all(world, rng)
+    camera = f"{FISHEYE[0]} {FISHEYE[1]} {FISHEYE[2]} {' '.join(map(str, FISHEYE[3]))}"
+    (world.folder / "queries.txt").write_text(f"{query} {camera}\n")
+    with h5py.File(world.outputs / "matches.h5", "a") as file:
+        for name in (first, second):
+            matches = matches_of(world, query, name, rng, wrong=0.0)
+            file[f"{query.replace('/', '-')}/{name.replace('/', '-')}/matches0"] = matches.astype(np.int16)
+    (world.outputs / "pairs.txt").write_text(f"{query} {query}\n{query} {first}\n{query} {second}\n")
+    scene = load_scene(world.scene)
+    assert [view.name for view in scene.references] == [first, second]
+    said = " ".join(scene.remarks)
+    assert "Queries that are in the model, too: 1 image (db/1.jpg), not used as references." in said
+    assert "1 of 3 pairs" in said and "points of the model left out: without the queries, no two images see" in said
+    problem = scene.problem()
+    seen = {name: set(world.point_of[name][world.point_of[name] >= 0]) for name in REFERENCES}
+    stay = {
+        index for index in range(len(world.points)) if index not in seen[query] or index in seen[first] & seen[second]
+    }
+    used = {int(np.argmin(np.linalg.norm(world.points - point, axis=1))) for point in problem.points}
+    assert used and used <= stay and seen[query] & seen[first] - seen[second]
+    (world.folder / "queries.txt").write_text("".join(f"{name} {camera}\n" for name in REFERENCES))
+    with pytest.raises(InputError, match="all images of the model are queries"):
+        load_scene(world.scene)
+
+
 def test_query_without_keypoints_or_of_another_size(world, rng):
     write_all(world, rng)
     write_features(world, without=(QUERY,))
@@ -199,7 +238,7 @@ def test_missing_files_are_named(world, rng, name):
 STELLA = """
 kind = "hloc"
 name = "panorama pair"
-model = "{data}/colmap_equirect/0"
+model = "{model}"
 images = "{data}"
 queries = "queries.txt"
 truth = "truth.txt"
@@ -223,7 +262,13 @@ def test_own_matching_of_real_panoramas(tmp_path, rng, more):
     with h5py.File(tmp_path / "global.h5", "w") as file:
         for name in (query, reference):
             file[f"{name}/global_descriptor"] = rng.normal(size=16).astype(np.float16)
-    (tmp_path / "scene.toml").write_text(STELLA.format(data=data, more=more))
+    # The model has the query by another name, whose image is not there: it is no query of its own map.
+    model = tmp_path / "model"
+    model.mkdir()
+    for file in ("cameras.txt", "images.txt", "points3D.txt"):
+        text = (data / "colmap_equirect" / "0" / file).read_text()
+        (model / file).write_text(text.replace(query, "absent.jpg"))
+    (tmp_path / "scene.toml").write_text(STELLA.format(data=data, model=model, more=more))
     scene = load_scene(tmp_path / "scene.toml")
     problem = scene.problem()
     assert problem.reference_images == (data / reference,)

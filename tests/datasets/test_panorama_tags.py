@@ -74,6 +74,13 @@ def test_both_ways_of_writing_them_are_read(tmp_path, packet, suffix):
     assert found.source == "pitch and roll in the photograph's tags"
 
 
+def test_a_packet_that_ends_with_zeros_and_an_angle_beyond_180_degrees_are_read(tmp_path):
+    level = gravity_from_tags(view(tmp_path, ATTRIBUTES))
+    np.testing.assert_array_equal(gravity_from_tags(view(tmp_path, f"{ATTRIBUTES}\0\0")).down, level.down)
+    around = gravity_from_tags(view(tmp_path, ATTRIBUTES.replace('"2"', '"-358"')))
+    np.testing.assert_allclose(around.down, level.down, atol=1e-12)
+
+
 @pytest.mark.parametrize("suffix", ["jpg", "tif", "png"])
 def test_a_photograph_without_tags_is_named(tmp_path, suffix):
     with pytest.raises(InputError) as caught:

@@ -29,6 +29,7 @@ from spherloc.experiments.summary import (
     vehicle_trajectory,
     wilson,
 )
+from spherloc_viz.commands.sequence_text import sequence_text
 from tests.waiting import LIMIT_S
 
 
@@ -210,6 +211,28 @@ def test_limits_are_not_included_and_both_count(tmp_path: Path) -> None:
     scene = replace(sequence_of(5), thresholds=((1.0, 0.1), (2.0, 0.25)), where=str(tmp_path / "s.toml"))
     (tmp_path / "s.toml").write_text("")
     assert [rate.successes for rate in summarize(results_of(scene, rows)).success] == [1, 4]
+
+
+@pytest.mark.usefixtures("drawn")
+def test_success_is_told_of_each_folder_too(tmp_path: Path) -> None:
+    """Folders are cameras, or times of day: their success rates are published apart."""
+    scene = replace(scene_of(tmp_path), thresholds=((1.0, 0.1), (2.0, 0.25)))
+
+    def row(index: int, name: str, degrees: float, truth: bool = True) -> QueryResult:
+        pose = np.eye(3, 4)
+        return QueryResult(
+            index, name, "localized", cam_from_map=pose, truth_cam_from_map=pose if truth else None,
+            rotation_error_deg=degrees if truth else None, translation_error_m=0.05 if truth else None,
+        )  # fmt: skip
+
+    rows = [row(0, "day/0.png", 0.5), row(1, "day/1.png", 1.5), row(2, "night/0.png", 1.5)]
+    rows.append(row(3, "other/0.png", 0.0, truth=False))
+    told = results_of(scene, rows)
+    lines = sequence_text(told, summarize(told), scene).splitlines()
+    assert "    day: 50.0 / 100.0 % of 2" in lines and "    night: 0.0 / 100.0 % of 1" in lines
+    assert not any(line.startswith("    other") for line in lines)
+    alone = results_of(scene, rows[:2])
+    assert "    day: " not in sequence_text(alone, summarize(alone), scene)
 
 
 @pytest.mark.usefixtures("drawn")
