@@ -25,10 +25,10 @@ from benchmarks.maps import cells, uneven
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.frontend.features import extract
 from spherloc.geometry import camera_centre, pose, rotation_angle
-from spherloc.mapping.level_pairs import fitting
-from spherloc.mapping.pairs import SURE, ImagePairs, relative
+from spherloc.mapping.images.photographs import photographs
 from spherloc.mapping.parallel import as_completed
-from spherloc.mapping.photographs import photographs
+from spherloc.mapping.two_view.level_pairs import fitting
+from spherloc.mapping.two_view.pairs import SURE, ImagePairs, relative
 from spherloc.types import FloatArray
 from spherloc.worlds import Conditions, build_world, render
 from spherloc_viz.commands.map import how_of

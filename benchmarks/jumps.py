@@ -12,7 +12,7 @@ import numpy as np
 
 from spherloc.experiments.results import FAILED, LOCALIZED, QueryResult
 from spherloc.geometry import pose
-from spherloc.mapping.neighbours import MIN_FRAMES, jumps
+from spherloc.mapping.scenes.neighbours import MIN_FRAMES, jumps
 from spherloc.types import FloatArray
 
 SEQUENCES, SEED, NOISE_M, LIMIT_M = 400, 0, 0.03, 0.5

@@ -20,10 +20,10 @@ from spherloc.errors import InputError
 from spherloc.estimators import estimate
 from spherloc.files import is_image, names_in
 from spherloc.geometry import camera_centre
+from spherloc.mapping.images.photographs import photographs
 from spherloc.mapping.make import Map, make_map
-from spherloc.mapping.new_images import new_images_of
-from spherloc.mapping.photographs import photographs
 from spherloc.mapping.request import MapRequest
+from spherloc.mapping.scenes.new_images import new_images_of
 from spherloc.outcome import judge
 from spherloc.types import FloatArray
 from spherloc_viz.commands.map import how_of

@@ -21,8 +21,8 @@ from spherloc.datasets.scene_file import load_scene
 from spherloc.errors import InputError
 from spherloc.experiments.summary import align
 from spherloc.geometry import camera_centre
+from spherloc.mapping.images.photographs import photographs
 from spherloc.mapping.make import make_map
-from spherloc.mapping.photographs import photographs
 from spherloc.mapping.request import MapRequest
 from spherloc.types import ByteArray, FloatArray
 from spherloc_viz.commands.map import how_of

@@ -22,8 +22,8 @@ from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.datasets.scene_file import load_scene
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre, yaw_rotation
+from spherloc.mapping.images.photographs import photographs
 from spherloc.mapping.make import make_map
-from spherloc.mapping.photographs import photographs
 from spherloc.mapping.request import MapRequest
 from spherloc.types import ByteArray, FloatArray
 

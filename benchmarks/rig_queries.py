@@ -21,7 +21,7 @@ from spherloc.datasets.scene_file import load_scene
 from spherloc.estimators import options_type
 from spherloc.experiments.results import DOUBTFUL, LOCALIZED, QueryResult
 from spherloc.experiments.sequence import How, localize
-from spherloc.mapping.joint_outcome import judged_together
+from spherloc.mapping.scenes.joint_outcome import judged_together
 
 ROWS = (
     *("campus:7", "campus:11", "campus:3", "campus:21", "apartment:5", "apartment:12", "apartment:3"),

@@ -22,15 +22,15 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.geometry import camera_centre, rotation_angle
-from spherloc.mapping.frames import FrameChoice
+from spherloc.mapping.alignment.positions import SimilarityFit, overlaid
+from spherloc.mapping.alignment.rig_scale import fixed_images, scale_by_rig
+from spherloc.mapping.alignment.sequence import sequence_data
+from spherloc.mapping.alignment.true_poses import truth_words
+from spherloc.mapping.images.frames import FrameChoice
+from spherloc.mapping.images.photographs import photographs
 from spherloc.mapping.make import make_map
-from spherloc.mapping.new_images import new_images_of
-from spherloc.mapping.photographs import photographs
-from spherloc.mapping.positions import SimilarityFit, overlaid
 from spherloc.mapping.request import MapRequest, ScaleMeasurement
-from spherloc.mapping.rig_scale import fixed_images, scale_by_rig
-from spherloc.mapping.sequence import sequence_data
-from spherloc.mapping.true_poses import truth_words
+from spherloc.mapping.scenes.new_images import new_images_of
 from spherloc.types import FloatArray
 from spherloc.worlds import Conditions, build_world, render
 

@@ -20,7 +20,7 @@ from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.frontend.view import View
 from spherloc.geometry import so3_exp
 from spherloc.images import read_image
-from spherloc.mapping.line_gravity import gravity_by_lines
+from spherloc.mapping.alignment.line_gravity import gravity_by_lines
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "pano_vertical_pairs"
 PANORAMAS = ("room_up.png", "hall_up.png", "room_down.png", "hall_down.png")

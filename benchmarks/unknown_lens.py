@@ -27,11 +27,11 @@ from spherloc.errors import InputError
 from spherloc.files import is_image, names_in
 from spherloc.geometry import camera_centre
 from spherloc.images import read_image
+from spherloc.mapping.images.photographs import CalibratedLens, photographs
+from spherloc.mapping.images.unknown_lens import find_lens
 from spherloc.mapping.make import make_map
-from spherloc.mapping.photographs import CalibratedLens, photographs
 from spherloc.mapping.request import MapRequest
-from spherloc.mapping.scene_files import toml_value
-from spherloc.mapping.unknown_lens import find_lens
+from spherloc.mapping.scenes.scene_files import toml_value
 from spherloc.types import FloatArray
 
 SCENE = """

@@ -32,8 +32,8 @@ KERNEL_SOURCES = (
     "solvers",
     "consensus",
     "estimators",
-    "mapping/guided.py",
-    "mapping/level_pairs.py",
+    "mapping/two_view/guided.py",
+    "mapping/two_view/level_pairs.py",
 )
 """Files and folders of this package that hold kernels or code on which their results depend."""
 

@@ -14,7 +14,7 @@ import pytest
 import viser
 
 from spherloc.datasets.map_scene import MapScene
-from spherloc.mapping.scene_files import UNITS_UNKNOWN, MapHead, scene_text
+from spherloc.mapping.scenes.scene_files import UNITS_UNKNOWN, MapHead, scene_text
 from spherloc_viz.app.panels.open_panel import OpenedScene, OpenPanel, RecentScenes
 from spherloc_viz.app.panels.uploads import MAX_BYTES
 from spherloc_viz.app.web.touch import Touch, Touches

@@ -6,7 +6,7 @@ from spherloc import estimate
 from spherloc.datasets import load_scene
 from spherloc.experiments.results import DOUBTFUL, FAILED, LOCALIZED, QueryResult
 from spherloc.geometry import pose, yaw_rotation
-from spherloc.mapping.joint_outcome import TRIED
+from spherloc.mapping.scenes.joint_outcome import TRIED
 from spherloc_viz.app.said_together import SaidTogether, said_together
 from spherloc_viz.app.text import ToldBeside, summary_html
 from tests.tiny_scene import write_tiny_scene

@@ -73,6 +73,9 @@ FLOORS = (
 )
 """From the ground up; a room is a module or a package with all of its files."""
 
+MAPPING = ("advice", "parallel", "rig", "two_view", "images", "alignment", "models", "scenes")
+"""Rooms of spherloc.mapping, each of which imports only from itself and those before it."""
+
 FORBIDDEN = (
     # (files whose name starts with this, must not import this, why)
     ("spherloc_viz.layers", ("viser", "rerun", "aiohttp", "tyro"), "layers describe pictures for both painters"),
@@ -135,6 +138,20 @@ def floor_of(module):
 
 def place(module, line):
     return f"{MODULES[module].relative_to(ROOT)}:{line}"
+
+
+def test_rooms_of_mapping_import_from_those_before_them():
+    rooms = [f"spherloc.mapping.{name}" for name in MAPPING]
+    wrong = []
+    for number, room in enumerate(rooms):
+        below = rooms[: number + 1]
+        for module in (name for name in MODULES if inside(name, room)):
+            wrong += [
+                f"{place(module, line)} imports {name}"
+                for line, name in imports(module)
+                if inside(name, "spherloc.mapping") and not any(inside(name, one) for one in below)
+            ]
+    assert not wrong, wrong
 
 
 def test_every_module_has_a_floor():

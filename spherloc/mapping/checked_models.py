@@ -13,14 +13,14 @@ from spherloc.errors import InputError, StoppedError
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
 from spherloc.mapping.advice import advice
-from spherloc.mapping.carried import carried_nadir_deg
-from spherloc.mapping.kept_models import kept_or_made
-from spherloc.mapping.lens_in_map import lens_in_map
-from spherloc.mapping.line_gravity import GravityByLines, gravity_by_lines
-from spherloc.mapping.model import Reconstruction
+from spherloc.mapping.alignment.line_gravity import GravityByLines, gravity_by_lines
+from spherloc.mapping.images.carried import carried_nadir_deg
+from spherloc.mapping.images.photographs import CalibratedLens
+from spherloc.mapping.models.kept_models import kept_or_made
+from spherloc.mapping.models.lens_in_map import lens_in_map
+from spherloc.mapping.models.model import Reconstruction
+from spherloc.mapping.models.reconstruction import reconstruct
 from spherloc.mapping.parallel import Tell
-from spherloc.mapping.photographs import CalibratedLens
-from spherloc.mapping.reconstruction import reconstruct
 from spherloc.mapping.request import MapRequest
 
 MOVED_RAD, DOUBT_RAD = radians(0.5), radians(1.0)

@@ -9,7 +9,7 @@ import numpy as np
 
 from spherloc.errors import InputError, reason
 from spherloc.files import read_file, write_whole
-from spherloc.mapping.positions import Positions
+from spherloc.mapping.alignment.positions import Positions
 from spherloc.mapping.request import ScaleMeasurement
 
 FILE = "scale.json"

@@ -11,21 +11,10 @@ from spherloc.errors import InputError, SpherlocError, StoppedError, show
 from spherloc.files import lock
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
-from spherloc.mapping.checked_models import checked_models
-from spherloc.mapping.kept_models import forget
-from spherloc.mapping.later import place_rest
-from spherloc.mapping.line_gravity import GravityByLines
-from spherloc.mapping.matched import DATABASES
-from spherloc.mapping.misplaced import far_off
-from spherloc.mapping.model import Reconstruction
-from spherloc.mapping.parallel import Tell
-from spherloc.mapping.photographs import CalibratedLens
-from spherloc.mapping.positions import gps_of_images
-from spherloc.mapping.request import MapRequest, ScaleMeasurement
-from spherloc.mapping.rig import Shots, disagree, misfits, shots_of, went_apart
-from spherloc.mapping.rig_scale import doubt_of_scale, scale_by_rig
-from spherloc.mapping.scene_files import SCENE
-from spherloc.mapping.upright import (
+from spherloc.mapping.alignment.line_gravity import GravityByLines
+from spherloc.mapping.alignment.positions import gps_of_images
+from spherloc.mapping.alignment.rig_scale import doubt_of_scale, scale_by_rig
+from spherloc.mapping.alignment.upright import (
     Level,
     MapScale,
     arbitrary_scale,
@@ -34,7 +23,18 @@ from spherloc.mapping.upright import (
     scale_by_height,
     scale_by_positions,
 )
-from spherloc.mapping.written import Kept, Written, write_map
+from spherloc.mapping.checked_models import checked_models
+from spherloc.mapping.images.photographs import CalibratedLens
+from spherloc.mapping.models.kept_models import forget
+from spherloc.mapping.models.later import place_rest
+from spherloc.mapping.models.misplaced import far_off
+from spherloc.mapping.models.model import Reconstruction
+from spherloc.mapping.parallel import Tell
+from spherloc.mapping.request import MapRequest, ScaleMeasurement
+from spherloc.mapping.rig import Shots, disagree, misfits, shots_of, went_apart
+from spherloc.mapping.scenes.scene_files import SCENE
+from spherloc.mapping.scenes.written import Kept, Written, write_map
+from spherloc.mapping.two_view.matched import DATABASES
 
 GROUP = "group"
 """Name of the folder, with a number, of a map of images that could not be joined with the rest."""

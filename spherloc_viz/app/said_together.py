@@ -6,7 +6,7 @@ import numpy as np
 
 from spherloc.experiments.results import DOUBTFUL, LOCALIZED, QueryResult
 from spherloc.geometry import camera_centre, rotation_angle
-from spherloc.mapping.joint_outcome import tried_anew
+from spherloc.mapping.scenes.joint_outcome import tried_anew
 from spherloc.types import FloatArray
 
 

@@ -114,7 +114,7 @@ def localize(
 
 def _results_name(path: Path) -> str:
     """What results of a scene file are called: its name, in a map after that of the map, and of the group in it."""
-    from spherloc.mapping.scene_files import MODEL, SCENE
+    from spherloc.mapping.scenes.scene_files import MODEL, SCENE
 
     names, folder = [path.stem], path.resolve().parent
     while is_file(folder / SCENE) and is_folder(folder / MODEL):

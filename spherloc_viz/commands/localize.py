@@ -33,7 +33,7 @@ from spherloc.experiments.summary import (
     vehicle_trajectory,
 )
 from spherloc.frontend.view import View
-from spherloc.mapping.joint_outcome import judged_together
+from spherloc.mapping.scenes.joint_outcome import judged_together
 from spherloc.trace import Trace
 from spherloc.trajectory import write_tum
 from spherloc.warm_up import warm_up

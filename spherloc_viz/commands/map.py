@@ -31,15 +31,16 @@ from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.images import check_image, read_size
 from spherloc.mapping.advice import advice, for_a_page
-from spherloc.mapping.frames import FRAMES, FrameChoice, frames_of
-from spherloc.mapping.given_cameras import given_cameras
-from spherloc.mapping.gravity_check import check_stated
-from spherloc.mapping.kept_scale import FILE as SCALE_FILE
-from spherloc.mapping.kept_scale import keep_scale, kept_scale
-from spherloc.mapping.make import Map, make_map
-from spherloc.mapping.new_images import NewImages, new_images_of
-from spherloc.mapping.parallel import Tell
-from spherloc.mapping.photographs import (
+from spherloc.mapping.alignment.gravity_check import check_stated
+from spherloc.mapping.alignment.positions import read_positions
+from spherloc.mapping.alignment.rig_scale import fixed_images
+from spherloc.mapping.alignment.sequence import sequence_data
+from spherloc.mapping.alignment.stated_gravity import read_stated_gravity
+from spherloc.mapping.alignment.tag_gravity import stated_by_tags
+from spherloc.mapping.alignment.true_poses import truth_words
+from spherloc.mapping.images.frames import FRAMES, FrameChoice, frames_of
+from spherloc.mapping.images.given_cameras import given_cameras
+from spherloc.mapping.images.photographs import (
     CalibratedLens,
     LensFinder,
     Photographs,
@@ -47,10 +48,13 @@ from spherloc.mapping.photographs import (
     cameras_of,
     photographs,
 )
-from spherloc.mapping.positions import read_positions
+from spherloc.mapping.kept_scale import FILE as SCALE_FILE
+from spherloc.mapping.kept_scale import keep_scale, kept_scale
+from spherloc.mapping.make import Map, make_map
+from spherloc.mapping.parallel import Tell
 from spherloc.mapping.request import MapRequest, ScaleMeasurement
-from spherloc.mapping.rig_scale import fixed_images
-from spherloc.mapping.scene_files import (
+from spherloc.mapping.scenes.new_images import NewImages, new_images_of
+from spherloc.mapping.scenes.scene_files import (
     LENS,
     MAP_FOLDER,
     check_images_of,
@@ -60,10 +64,6 @@ from spherloc.mapping.scene_files import (
     was_given,
     write_lenses,
 )
-from spherloc.mapping.sequence import sequence_data
-from spherloc.mapping.stated_gravity import read_stated_gravity
-from spherloc.mapping.tag_gravity import stated_by_tags
-from spherloc.mapping.true_poses import truth_words
 from spherloc.registry import require
 from spherloc.types import FloatArray
 from spherloc_viz.commands.map_report import MAP_FEATURES, map_report, summary
@@ -195,7 +195,7 @@ def _lens_finder(tell: Tell, folder: Path, target: Path, new_images: Path | None
     instead."""
 
     def find(paths: Sequence[Path], size: tuple[int, int]) -> CalibratedLens:
-        from spherloc.mapping.unknown_lens import find_lens
+        from spherloc.mapping.images.unknown_lens import find_lens
 
         place = paths[0].parent
         path = lens_path(target, "" if place == folder else camera_of_folder(place))

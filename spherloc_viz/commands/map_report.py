@@ -12,11 +12,11 @@ from spherloc.frontend import trained
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
 from spherloc.mapping.advice import advice
-from spherloc.mapping.line_gravity import LEANING_DEG, share_below
+from spherloc.mapping.alignment.line_gravity import LEANING_DEG, share_below
+from spherloc.mapping.images.photographs import Photographs, cameras_of
 from spherloc.mapping.make import Map
-from spherloc.mapping.pairs import MIN_MATCHES
-from spherloc.mapping.photographs import Photographs, cameras_of
 from spherloc.mapping.rig import shots_of, words
+from spherloc.mapping.two_view.pairs import MIN_MATCHES
 from spherloc.types import FloatArray
 from spherloc_viz.plots.map_above import map_above
 

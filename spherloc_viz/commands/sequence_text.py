@@ -12,7 +12,7 @@ from spherloc.experiments.sequence import INITIALISED
 from spherloc.experiments.summary import SuccessRate, Summary, TrajectoryError, success_rates, timed
 from spherloc.frontend.gravity_from_lines import why_not_found
 from spherloc.frontend.pipeline import NO_POINT
-from spherloc.mapping.joint_outcome import TRIED, tried_anew
+from spherloc.mapping.scenes.joint_outcome import TRIED, tried_anew
 from spherloc_viz.layers.where_taken import nearest
 
 MAX_TOLD, MAX_EACH = 5, 20

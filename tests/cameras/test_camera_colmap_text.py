@@ -5,7 +5,7 @@ import pytest
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.errors import CalibrationError
-from spherloc.mapping.given_cameras import given_cameras
+from spherloc.mapping.images.given_cameras import given_cameras
 
 TWO = """# Camera list with one line of data per camera:
 #   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from spherloc.cameras.calibration import load_camera
 from spherloc.cameras.ocam import Ocam
 from spherloc.errors import CalibrationError
-from spherloc.mapping.lens import for_colmap
+from spherloc.mapping.images.lens import for_colmap
 from spherloc.testing import check_camera
 
 pytestmark = pytest.mark.filterwarnings("error")

@@ -12,7 +12,7 @@ from spherloc.consensus.spread import MAX_RADIUS_DEG, MIN_REST, spread_of
 from spherloc.diagnosis.causes import Cause
 from spherloc.diagnosis.decide import diagnose
 from spherloc.estimators.base import estimate
-from spherloc.mapping.pairs import fit_on_one_thing
+from spherloc.mapping.two_view.pairs import fit_on_one_thing
 from spherloc.outcome import Outcome, judge
 
 PANORAMA = Equirectangular(400, 200)

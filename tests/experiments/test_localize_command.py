@@ -30,7 +30,7 @@ from spherloc.experiments.kept_results import kept_results
 from spherloc.experiments.sequence import inputs_of, localize
 from spherloc.experiments.summary import summarize
 from spherloc.frontend.view import Gravity, View
-from spherloc.mapping.scene_files import MODEL, SCENE
+from spherloc.mapping.scenes.scene_files import MODEL, SCENE
 from spherloc.trajectory import read_tum
 from spherloc.warm_up import warm_up
 from spherloc_viz.app.catalog import Catalog

@@ -7,7 +7,7 @@ import pycolmap
 
 from spherloc.geometry import pose
 from spherloc.mapping.make import nearer_to_others
-from spherloc.mapping.model import Reconstruction, SeenPoints, contradictions, parted, untangled
+from spherloc.mapping.models.model import Reconstruction, SeenPoints, contradictions, parted, untangled
 
 ROOMS = {"day_0", "day_1", "day_2"}, {"night_0", "night_1", "night_2", "night_3"}
 NAMES = sorted(set.union(*ROOMS))

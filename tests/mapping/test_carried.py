@@ -7,9 +7,9 @@ import pytest
 
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.frontend.masks import around
-from spherloc.mapping.carried import BELOW_DEG, carried_nadir_deg
+from spherloc.mapping.images.carried import BELOW_DEG, carried_nadir_deg
+from spherloc.mapping.images.photographs import photographs
 from spherloc.mapping.make import make_map
-from spherloc.mapping.photographs import photographs
 from spherloc.mapping.request import MapRequest
 from spherloc_viz.commands.map_report import summary
 from tests.frontend.pictures import texture

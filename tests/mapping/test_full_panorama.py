@@ -7,8 +7,8 @@ from PIL import Image
 
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError
-from spherloc.mapping.full_panorama import are_full_panoramas
-from spherloc.mapping.photographs import photographs
+from spherloc.mapping.images.full_panorama import are_full_panoramas
+from spherloc.mapping.images.photographs import photographs
 
 XMP = (
     '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'

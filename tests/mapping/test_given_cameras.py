@@ -12,7 +12,7 @@ from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.cameras.scaling import scaled
 from spherloc.errors import CalibrationError
-from spherloc.mapping.given_cameras import given_cameras
+from spherloc.mapping.images.given_cameras import given_cameras
 
 FOCAL = 1280, 960, 400.0, 402.0, 650.0, 470.0
 FISHEYE = KannalaBrandt(*FOCAL, (0.01, -0.002, 0.001, 0.0))

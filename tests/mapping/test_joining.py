@@ -8,10 +8,10 @@ import pytest
 
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.geometry import camera_centre, pose, so3_exp, transform, yaw_rotation
-from spherloc.mapping.joining import joined_by_pairs
-from spherloc.mapping.matched import Matched, _camera_in
-from spherloc.mapping.model import Reconstruction
-from spherloc.mapping.pair_evidence import PairEvidence, distance_of
+from spherloc.mapping.models.joining import joined_by_pairs
+from spherloc.mapping.models.model import Reconstruction
+from spherloc.mapping.models.pair_evidence import PairEvidence, distance_of
+from spherloc.mapping.two_view.matched import Matched, _camera_in
 from tests.mapping.test_rig import in_another_frame
 
 PANORAMA = Equirectangular(1000, 500)

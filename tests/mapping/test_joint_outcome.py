@@ -15,9 +15,9 @@ from spherloc.experiments.results import DOUBTFUL, FAILED, LOCALIZED, QueryResul
 from spherloc.experiments.sequence import How, localize
 from spherloc.frontend.view import Gravity, Matches, View
 from spherloc.geometry import DOWN, camera_centre, pose, transform, yaw_rotation
-from spherloc.mapping.joint_outcome import judged_together, tried_anew
-from spherloc.mapping.neighbours import jumps
 from spherloc.mapping.rig import rig_of
+from spherloc.mapping.scenes.joint_outcome import judged_together, tried_anew
+from spherloc.mapping.scenes.neighbours import jumps
 
 CAMERA = KannalaBrandt(560, 560, 205.0, 205.0, 280.0, 280.0, (0.0, 0.0, 0.0, 0.0))
 LOOKS = {"left": np.radians(-70.0), "front": 0.0, "right": np.radians(70.0)}

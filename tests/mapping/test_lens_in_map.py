@@ -14,12 +14,12 @@ from spherloc.errors import InputError, StoppedError
 from spherloc.frontend.view import View
 from spherloc.geometry import so3_exp
 from spherloc.mapping import checked_models as checks
-from spherloc.mapping.lens_in_map import LensInMap, lens_in_map
-from spherloc.mapping.model import Reconstruction
-from spherloc.mapping.new_images import NewImages
-from spherloc.mapping.photographs import CalibratedLens
+from spherloc.mapping.images.photographs import CalibratedLens
+from spherloc.mapping.models.lens_in_map import LensInMap, lens_in_map
+from spherloc.mapping.models.model import Reconstruction
 from spherloc.mapping.request import MapRequest
-from spherloc.mapping.scene_files import lens_path, lenses_given, was_given, write_lenses
+from spherloc.mapping.scenes.new_images import NewImages
+from spherloc.mapping.scenes.scene_files import lens_path, lenses_given, was_given, write_lenses
 
 TRUE = KannalaBrandt(640, 640, 239.0, 239.0, 319.0, 322.0, (0.003, 0.001, 0.0, 0.0))
 WRONG = KannalaBrandt(640, 640, 226.0, 226.0, 320.0, 321.0, (0.03, 0.0005, 0.0, 0.0))

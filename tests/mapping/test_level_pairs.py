@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from spherloc.geometry import pose, rotation_angle, so3_exp, transform, yaw_rotation
-from spherloc.mapping.level_pairs import chance_of_fit, fitting, level_pair, log10_nfa
+from spherloc.mapping.two_view.level_pairs import chance_of_fit, fitting, level_pair, log10_nfa
 
 
 def unit(rows):

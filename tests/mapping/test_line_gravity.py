@@ -13,9 +13,9 @@ from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.errors import InputError
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import camera_centre, so3_exp
-from spherloc.mapping.gravity_check import check_stated
-from spherloc.mapping.line_gravity import gravity_by_lines, share_below
-from spherloc.mapping.stated_gravity import StatedGravity
+from spherloc.mapping.alignment.gravity_check import check_stated
+from spherloc.mapping.alignment.line_gravity import gravity_by_lines, share_below
+from spherloc.mapping.alignment.stated_gravity import StatedGravity
 
 COUNT = 7
 

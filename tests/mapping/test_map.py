@@ -33,20 +33,22 @@ from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, rotation_angle, so3_exp
 from spherloc.mapping.advice import COMMAND, PAGE, for_a_page
-from spherloc.mapping.frames import frames_of
-from spherloc.mapping.full_panorama import two_circles
-from spherloc.mapping.given_cameras import given_cameras
-from spherloc.mapping.kept_models import FILE as KEPT_MODELS
-from spherloc.mapping.later import place_rest
-from spherloc.mapping.lens import for_colmap
-from spherloc.mapping.line_gravity import gravity_by_lines
+from spherloc.mapping.alignment.line_gravity import gravity_by_lines
+from spherloc.mapping.alignment.stated_gravity import read_stated_gravity
+from spherloc.mapping.alignment.upright import Level, level_of, scale_by_height, upright_frame
+from spherloc.mapping.images.frames import frames_of
+from spherloc.mapping.images.full_panorama import two_circles
+from spherloc.mapping.images.given_cameras import given_cameras
+from spherloc.mapping.images.lens import for_colmap
+from spherloc.mapping.images.photographs import Photographs, is_called, photographs
 from spherloc.mapping.make import make_map, scale_of
-from spherloc.mapping.misplaced import far_off, without_misplaced
-from spherloc.mapping.new_images import NewImages, new_images_of
-from spherloc.mapping.new_queries import add_new_images, map_images
-from spherloc.mapping.photographs import Photographs, is_called, photographs
+from spherloc.mapping.models.kept_models import FILE as KEPT_MODELS
+from spherloc.mapping.models.later import place_rest
+from spherloc.mapping.models.misplaced import far_off, without_misplaced
 from spherloc.mapping.request import MapRequest, ScaleMeasurement
-from spherloc.mapping.scene_files import (
+from spherloc.mapping.scenes.new_images import NewImages, new_images_of
+from spherloc.mapping.scenes.new_queries import add_new_images, map_images
+from spherloc.mapping.scenes.scene_files import (
     MODEL,
     SCENE,
     UNITS_UNKNOWN,
@@ -56,9 +58,7 @@ from spherloc.mapping.scene_files import (
     check_images_of,
     write_new_scene,
 )
-from spherloc.mapping.stated_gravity import read_stated_gravity
-from spherloc.mapping.upright import Level, level_of, scale_by_height, upright_frame
-from spherloc.mapping.written import _gravity
+from spherloc.mapping.scenes.written import _gravity
 from spherloc.problem import Problem
 from spherloc_viz.commands.image_commands import map as map_command
 from spherloc_viz.commands.map import (
@@ -851,7 +851,7 @@ def test_a_video_without_an_end_is_one_sentence(tmp_path):
     (tmp_path / "cut.mp4").write_bytes(b"\0\0\0\x14ftypisom\0\0\2\0isom" + b"\0\0\0\x10mdat" + bytes(8))
     script = (
         "import os\nfrom pathlib import Path\nfrom spherloc.errors import InputError\n"
-        "from spherloc.mapping.frames import frames_of\nbefore = dict(os.environ)\n"
+        "from spherloc.mapping.images.frames import frames_of\nbefore = dict(os.environ)\n"
         "try:\n    frames_of(Path('cut.mp4'), Path('frames'), 3, print)\n"
         "except InputError as error:\n    print(error, os.environ == before)"
     )

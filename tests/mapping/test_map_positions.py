@@ -12,10 +12,10 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError
 from spherloc.frontend.view import View
 from spherloc.geometry import so3_exp
+from spherloc.mapping.alignment.positions import Positions, gps_of_images, local_metres, overlaid, read_positions
+from spherloc.mapping.alignment.upright import Level, MapScale, scale_by_positions
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
-from spherloc.mapping.positions import Positions, gps_of_images, local_metres, overlaid, read_positions
 from spherloc.mapping.request import ScaleMeasurement
-from spherloc.mapping.upright import Level, MapScale, scale_by_positions
 from spherloc_viz.commands.map_report import other_units
 
 CLOCK_S = 1_700_000_000

@@ -11,8 +11,8 @@ from spherloc.frontend.features import Features, _joined
 from spherloc.frontend.matching import MatchOptions
 from spherloc.frontend.view import Gravity
 from spherloc.geometry import DOWN, pose, rotation_angle, so3_exp, transform, yaw_rotation
-from spherloc.mapping.pairs import SURE, ImagePairs, relative
-from spherloc.mapping.telling import below_sky, far_rotation, unmoved
+from spherloc.mapping.two_view.pairs import SURE, ImagePairs, relative
+from spherloc.mapping.two_view.telling import below_sky, far_rotation, unmoved
 
 CAMERA = Equirectangular(2048, 1024)
 FISHEYE = KannalaBrandt(800, 800, 250.0, 250.0, 400.0, 400.0, (0.0,) * 4)

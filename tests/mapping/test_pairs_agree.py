@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from spherloc.geometry import pose, rotation_angle, so3_exp, transform
-from spherloc.mapping.guided import guided_matches
-from spherloc.mapping.rotations import agreeing
-from spherloc.mapping.triangles import open_triangles, through
+from spherloc.mapping.two_view.guided import guided_matches
+from spherloc.mapping.two_view.rotations import agreeing
+from spherloc.mapping.two_view.triangles import open_triangles, through
 
 
 def unit(rows):

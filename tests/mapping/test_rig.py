@@ -10,9 +10,8 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN, camera_centre, pose, rotation_angle, so3_exp, transform, yaw_rotation
-from spherloc.mapping.matched import _camera_in
-from spherloc.mapping.model import Reconstruction
-from spherloc.mapping.reconstruction import _joined
+from spherloc.mapping.models.model import Reconstruction
+from spherloc.mapping.models.reconstruction import _joined
 from spherloc.mapping.rig import (
     disagree,
     expected_poses,
@@ -24,6 +23,7 @@ from spherloc.mapping.rig import (
     with_ties,
     words,
 )
+from spherloc.mapping.two_view.matched import _camera_in
 
 FISHEYE = KannalaBrandt(560, 560, 205.0, 205.0, 280.0, 280.0, (0.0, 0.0, 0.0, 0.0))
 LOOKS = {"left": np.radians(-70.0), "right": np.radians(70.0)}

@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from spherloc.errors import InputError
 from spherloc.geometry import pose
-from spherloc.mapping.given_cameras import given_cameras
+from spherloc.mapping.alignment.positions import Positions
+from spherloc.mapping.alignment.rig_scale import FixedImages, doubt_of_scale, fixed_images, scale_by_rig
+from spherloc.mapping.alignment.upright import Level, MapScale
+from spherloc.mapping.images.given_cameras import given_cameras
+from spherloc.mapping.images.photographs import photographs
 from spherloc.mapping.make import scale_of
-from spherloc.mapping.photographs import photographs
-from spherloc.mapping.positions import Positions
 from spherloc.mapping.request import ScaleMeasurement
-from spherloc.mapping.rig_scale import FixedImages, doubt_of_scale, fixed_images, scale_by_rig
-from spherloc.mapping.upright import Level, MapScale
 from tests.datasets.asl_tree import euroc, transform, tum_vi
 
 METRES_PER_UNIT = 3.7

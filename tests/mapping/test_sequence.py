@@ -12,12 +12,12 @@ from spherloc.datasets.asl_layout import asl_sequence
 from spherloc.datasets.query_gravity import read_gravity_file
 from spherloc.errors import InputError
 from spherloc.frontend.masks import Masks
-from spherloc.mapping.frames import FRAMES, FrameChoice, ImageFolder, chosen
-from spherloc.mapping.new_images import new_images_of
-from spherloc.mapping.photographs import photographs, with_cameras
+from spherloc.mapping.alignment.sequence import sequence_data
+from spherloc.mapping.images.frames import FRAMES, FrameChoice, ImageFolder, chosen
+from spherloc.mapping.images.photographs import photographs, with_cameras
 from spherloc.mapping.rig import shots_of
-from spherloc.mapping.scene_files import MapHead, write_new_scene
-from spherloc.mapping.sequence import sequence_data
+from spherloc.mapping.scenes.new_images import new_images_of
+from spherloc.mapping.scenes.scene_files import MapHead, write_new_scene
 from tests.datasets.asl_tree import START, STEP_NS, euroc, sensor_yaml, tum_vi
 
 
@@ -66,7 +66,7 @@ def test_calibrations_gravity_and_positions_are_found(tmp_path, rng, write, key)
 
 def test_more_images_than_a_map_can_have_are_refused(tmp_path, rng, monkeypatch):
     euroc(tmp_path, rng)
-    monkeypatch.setattr("spherloc.mapping.photographs.MAX_IMAGES", 20)
+    monkeypatch.setattr("spherloc.mapping.images.photographs.MAX_IMAGES", 20)
     assert len(photographs(tmp_path, {}, choice=FrameChoice(10)).views) == 20
     with pytest.raises(
         InputError, match=r"24 photographs of all cameras are too many for a map, 20 at most; give fewer"

@@ -7,9 +7,9 @@ from PIL import Image
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets.panorama_tags import SOURCE, down_of
 from spherloc.geometry import align_to_down
-from spherloc.mapping.new_images import new_images_of
-from spherloc.mapping.photographs import photographs
-from spherloc.mapping.tag_gravity import stated_by_tags
+from spherloc.mapping.alignment.tag_gravity import stated_by_tags
+from spherloc.mapping.images.photographs import photographs
+from spherloc.mapping.scenes.new_images import new_images_of
 
 HEIGHT = 320
 XMP = (

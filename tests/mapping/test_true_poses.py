@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from spherloc.geometry import inverse_pose, pose, rotation_angle
-from spherloc.mapping.new_images import NewImages, new_images_of
-from spherloc.mapping.photographs import Photographs, photographs
-from spherloc.mapping.scene_files import UNITS_METRES, MapHead, write_new_scene
-from spherloc.mapping.true_poses import GroundTruth, aligned_truth, ground_truth, truth_words
+from spherloc.mapping.alignment.true_poses import GroundTruth, aligned_truth, ground_truth, truth_words
+from spherloc.mapping.images.photographs import Photographs, photographs
+from spherloc.mapping.scenes.new_images import NewImages, new_images_of
+from spherloc.mapping.scenes.scene_files import UNITS_METRES, MapHead, write_new_scene
 from tests.datasets.asl_tree import euroc, tum_vi
 
 SCALE, TURN, SHIFT = 1.3, Rotation.random(random_state=3).as_matrix(), np.array([4.0, -2.0, 7.0])

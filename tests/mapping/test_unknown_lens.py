@@ -15,12 +15,12 @@ from spherloc.datasets import load_scene
 from spherloc.errors import InputError
 from spherloc.frontend.view import View
 from spherloc.geometry import so3_exp
-from spherloc.mapping import lens_fit, unknown_lens
-from spherloc.mapping.image_circle import image_circle
-from spherloc.mapping.lens_fit import Circle, RadialLens, fit_lens
-from spherloc.mapping.photographs import CalibratedLens, Photographs, photographs
-from spherloc.mapping.scene_files import LENS, lenses_given, write_lenses
-from spherloc.mapping.unknown_lens import MAX_OFF_RAD, find_lens
+from spherloc.mapping.images import lens_fit, unknown_lens
+from spherloc.mapping.images.image_circle import image_circle
+from spherloc.mapping.images.lens_fit import Circle, RadialLens, fit_lens
+from spherloc.mapping.images.photographs import CalibratedLens, Photographs, photographs
+from spherloc.mapping.images.unknown_lens import MAX_OFF_RAD, find_lens
+from spherloc.mapping.scenes.scene_files import LENS, lenses_given, write_lenses
 from spherloc_viz.commands.map import _lens_finder, _lens_told
 
 TRUE = KannalaBrandt(900, 700, 270.0, 270.0, 458.0, 343.0, (-1 / 24, 1 / 1920, 0.0, 0.0))

@@ -14,7 +14,7 @@ from spherloc.experiments.kept_results import kept_results
 from spherloc.experiments.results import LOCALIZED, QueryResult
 from spherloc.experiments.sequence import How, localize
 from spherloc.experiments.summary import success_rates
-from spherloc.mapping.joint_outcome import judged_together
+from spherloc.mapping.scenes.joint_outcome import judged_together
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
 from spherloc_viz.app.controls.query_strip import QueryStrip

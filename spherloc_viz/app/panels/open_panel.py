@@ -14,9 +14,9 @@ from spherloc.disk_cache import cache_folder, store
 from spherloc.errors import InputError
 from spherloc.files import is_file
 from spherloc.mapping.advice import for_a_page
-from spherloc.mapping.new_queries import add_new_images, map_images, map_size
-from spherloc.mapping.photographs import MIN_IMAGES
-from spherloc.mapping.scene_files import MAP_FOLDER, SCENE
+from spherloc.mapping.images.photographs import MIN_IMAGES
+from spherloc.mapping.scenes.new_queries import add_new_images, map_images, map_size
+from spherloc.mapping.scenes.scene_files import MAP_FOLDER, SCENE
 from spherloc_viz.app.panels.folders import Listing, Roots, Row, and_words, describe
 from spherloc_viz.app.panels.map_panel import MapPanel
 from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_CALIBRATION_BYTES, File, Scratch, UploadForm, open_upload

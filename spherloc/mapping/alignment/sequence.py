@@ -17,8 +17,8 @@ from spherloc.files import is_file
 from spherloc.formats.text_rows import finite_numbers, rows
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
-from spherloc.mapping.positions import MAX_GAP_S, MIN_POSITIONS, Positions
-from spherloc.mapping.stated_gravity import BOUND_RAD, StatedGravity, without_words
+from spherloc.mapping.alignment.positions import MAX_GAP_S, MIN_POSITIONS, Positions
+from spherloc.mapping.alignment.stated_gravity import BOUND_RAD, StatedGravity, without_words
 from spherloc.trajectory import NS_PER_S, Trajectory, pose_at, read_euroc
 from spherloc.types import FloatArray
 

@@ -24,12 +24,12 @@ from spherloc.files import names_in
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.mapping.advice import advice
-from spherloc.mapping.lens import for_colmap
-from spherloc.mapping.photographs import CALIBRATIONS, CALLED_CALIBRATION, MAX_CALIBRATIONS, is_called
-from spherloc.mapping.positions import MAX_SCALE_SD, NEAR_SD
+from spherloc.mapping.alignment.positions import MAX_SCALE_SD, NEAR_SD
+from spherloc.mapping.alignment.sequence import shots_of_sequence
+from spherloc.mapping.alignment.upright import MapScale
+from spherloc.mapping.images.lens import for_colmap
+from spherloc.mapping.images.photographs import CALIBRATIONS, CALLED_CALIBRATION, MAX_CALIBRATIONS, is_called
 from spherloc.mapping.rig import TURNED_RAD, Key, camera_and_key, taken_together
-from spherloc.mapping.sequence import shots_of_sequence
-from spherloc.mapping.upright import MapScale
 from spherloc.types import FloatArray
 
 MIN_TIMES = 3

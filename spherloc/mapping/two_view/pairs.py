@@ -22,11 +22,11 @@ from spherloc.frontend.features import Features
 from spherloc.frontend.matching import FeatureMatches, MatchOptions, match
 from spherloc.frontend.view import Gravity
 from spherloc.geometry import DOWN, rotation_angle
-from spherloc.mapping.guided import guided_matches
-from spherloc.mapping.level_pairs import chance_of_fit, fitting, level_pair, log10_nfa
-from spherloc.mapping.rotations import OFF_RAD
-from spherloc.mapping.telling import below_sky, far_rotation, unmoved
-from spherloc.mapping.triangles import MIN_FIT, Pair, Relative, elsewhere, through
+from spherloc.mapping.two_view.guided import guided_matches
+from spherloc.mapping.two_view.level_pairs import chance_of_fit, fitting, level_pair, log10_nfa
+from spherloc.mapping.two_view.rotations import OFF_RAD
+from spherloc.mapping.two_view.telling import below_sky, far_rotation, unmoved
+from spherloc.mapping.two_view.triangles import MIN_FIT, Pair, Relative, elsewhere, through
 from spherloc.types import BoolArray, FloatArray
 
 MIN_MATCHES = 15

@@ -26,11 +26,11 @@ from spherloc.frontend.features import VERSION, Features, extract
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
-from spherloc.mapping.pairs import MIN_MATCHES, SURE, ImagePairs, relative
 from spherloc.mapping.parallel import Tell, as_completed
 from spherloc.mapping.rig import shots_of
-from spherloc.mapping.rotations import agreeing
-from spherloc.mapping.triangles import Pair, open_triangles
+from spherloc.mapping.two_view.pairs import MIN_MATCHES, SURE, ImagePairs, relative
+from spherloc.mapping.two_view.rotations import agreeing
+from spherloc.mapping.two_view.triangles import Pair, open_triangles
 from spherloc.registry import require
 from spherloc.types import BoolArray, FloatArray
 

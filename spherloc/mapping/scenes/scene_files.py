@@ -19,9 +19,9 @@ from spherloc.errors import InputError, SpherlocError
 from spherloc.files import is_file, is_folder, read_file
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
-from spherloc.mapping.new_images import NewImages
-from spherloc.mapping.photographs import CalibratedLens, cameras_of
-from spherloc.mapping.true_poses import AlignedTruth
+from spherloc.mapping.alignment.true_poses import AlignedTruth
+from spherloc.mapping.images.photographs import CalibratedLens, cameras_of
+from spherloc.mapping.scenes.new_images import NewImages
 
 MODEL = "model"
 """Folder of COLMAP's model in that of the map."""

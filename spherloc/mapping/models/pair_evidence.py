@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.consensus.spread import spread_of
 from spherloc.geometry import transform
-from spherloc.mapping.level_pairs import chance_of_fit, fitting
-from spherloc.mapping.matched import Matched, Names
-from spherloc.mapping.model import Reconstruction
-from spherloc.mapping.pairs import SURE, relative
+from spherloc.mapping.models.model import Reconstruction
+from spherloc.mapping.two_view.level_pairs import chance_of_fit, fitting
+from spherloc.mapping.two_view.matched import Matched, Names
+from spherloc.mapping.two_view.pairs import SURE, relative
 from spherloc.types import BoolArray, FloatArray
 
 NOISE_RAD, MAX_SPREAD = float(np.radians(0.3)), 0.15

@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from spherloc.mapping.later import with_images
-from spherloc.mapping.matched import Matched, Names
-from spherloc.mapping.model import Reconstruction, SeenPoints, contradictions, points_of
-from spherloc.mapping.pair_evidence import PairEvidence, VerifiedPair
-from spherloc.mapping.pairs import SURE
+from spherloc.mapping.models.later import with_images
+from spherloc.mapping.models.model import Reconstruction, SeenPoints, contradictions, points_of
+from spherloc.mapping.models.pair_evidence import PairEvidence, VerifiedPair
 from spherloc.mapping.parallel import Tell
+from spherloc.mapping.two_view.matched import Matched, Names
+from spherloc.mapping.two_view.pairs import SURE
 from spherloc.types import FloatArray
 
 MIN_FITTING, LEAST, MOST = 20, 0.3, 0.6

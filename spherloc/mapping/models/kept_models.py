@@ -20,7 +20,7 @@ from spherloc.files import is_file, names_in, open_file, read_file
 from spherloc.frontend.features import VERSION
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
-from spherloc.mapping.model import Reconstruction
+from spherloc.mapping.models.model import Reconstruction
 from spherloc.mapping.rig import shots_of
 from spherloc.registry import require
 

@@ -11,11 +11,11 @@ from spherloc.errors import InputError
 from spherloc.files import is_file, is_folder, is_image, names_in
 from spherloc.frontend.view import Gravity, View
 from spherloc.images import read_size
-from spherloc.mapping.frames import FrameChoice
-from spherloc.mapping.photographs import Photographs, cameras_of, with_cameras
-from spherloc.mapping.sequence import sequence_data
-from spherloc.mapping.tag_gravity import stated_by_tags
-from spherloc.mapping.true_poses import GroundTruth, ground_truth
+from spherloc.mapping.alignment.sequence import sequence_data
+from spherloc.mapping.alignment.tag_gravity import stated_by_tags
+from spherloc.mapping.alignment.true_poses import GroundTruth, ground_truth
+from spherloc.mapping.images.frames import FrameChoice
+from spherloc.mapping.images.photographs import Photographs, cameras_of, with_cameras
 
 
 @dataclass(frozen=True)

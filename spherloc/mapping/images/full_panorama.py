@@ -10,7 +10,7 @@ import numpy as np
 from spherloc.datasets.panorama_tags import says_full_panorama
 from spherloc.images import grey, read_eighth, read_image, read_reduced
 from spherloc.mapping.advice import advice
-from spherloc.mapping.image_circle import BLACK
+from spherloc.mapping.images.image_circle import BLACK
 from spherloc.types import ByteArray, FloatArray
 
 MIN_PANORAMA_PX = 200

@@ -11,8 +11,8 @@ from spherloc.frontend.gravity_from_lines import gravity_of_lines, image_lines
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN
 from spherloc.images import grey
+from spherloc.mapping.alignment.stated_gravity import StatedGravity
 from spherloc.mapping.parallel import Tell, as_completed
-from spherloc.mapping.stated_gravity import StatedGravity
 from spherloc.types import FloatArray
 
 MAX_CHECKED = 8

@@ -12,9 +12,10 @@ from spherloc.files import is_folder
 from spherloc.formats.colmap_files import read_model
 from spherloc.formats.colmap_model import ColmapModel
 from spherloc.frontend.view import View
-from spherloc.mapping.new_images import new_images_of
-from spherloc.mapping.photographs import Photographs, cameras_of, with_cameras
-from spherloc.mapping.scene_files import (
+from spherloc.mapping.alignment.true_poses import aligned_truth, truth_words
+from spherloc.mapping.images.photographs import Photographs, cameras_of, with_cameras
+from spherloc.mapping.scenes.new_images import new_images_of
+from spherloc.mapping.scenes.scene_files import (
     GRAVITY,
     MODEL,
     UNITS_METRES,
@@ -23,7 +24,6 @@ from spherloc.mapping.scene_files import (
     toml_value,
     write_new_scene,
 )
-from spherloc.mapping.true_poses import aligned_truth, truth_words
 
 SECTIONS = ("gravity", "frontend", "masks")
 """Sections of a scene file that are the same for all queries of a map."""

@@ -10,7 +10,7 @@ from spherloc.datasets.imu import MIN_S, NAME_RULE, read_imu
 from spherloc.datasets.query_gravity import ImuLog, read_gravity_file
 from spherloc.errors import InputError, shorten, show
 from spherloc.frontend.view import Gravity, View
-from spherloc.mapping.photographs import cameras_of
+from spherloc.mapping.images.photographs import cameras_of
 from spherloc.types import FloatArray
 
 BOUND_RAD = float(np.radians(2.0))

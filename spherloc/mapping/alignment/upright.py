@@ -13,8 +13,8 @@ from spherloc.frontend.gravity_from_lines import SOURCE as LINES
 from spherloc.frontend.view import Gravity
 from spherloc.geometry import DOWN, align_to_down, camera_centre
 from spherloc.mapping.advice import advice
-from spherloc.mapping.line_gravity import middle
-from spherloc.mapping.positions import MAX_SCALE_SD, SWAPPED, Positions, overlaid
+from spherloc.mapping.alignment.line_gravity import middle
+from spherloc.mapping.alignment.positions import MAX_SCALE_SD, SWAPPED, Positions, overlaid
 from spherloc.types import FloatArray
 
 MIN_LINES = 3

@@ -19,9 +19,9 @@ from spherloc.experiments.sequence import How, solve_again
 from spherloc.frontend.pipeline import SHORTLIST, ImageMatcher
 from spherloc.frontend.view import Matches, Report, View
 from spherloc.geometry import camera_centre, rotation_angle, transform
-from spherloc.mapping.later import EXPECTED_RAD, MIN_INLIERS
-from spherloc.mapping.neighbours import jumps
+from spherloc.mapping.models.later import EXPECTED_RAD, MIN_INLIERS
 from spherloc.mapping.rig import MIN_TOGETHER, TURNED_RAD, FixedCameras, rig_of
+from spherloc.mapping.scenes.neighbours import jumps
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.errors import CalibrationError
-from spherloc.mapping.lens_fit import RadialLens
-from spherloc.mapping.model import Reconstruction, registered
+from spherloc.mapping.images.lens_fit import RadialLens
+from spherloc.mapping.models.model import Reconstruction, registered
 from spherloc.mapping.parallel import Tell
 from spherloc.registry import require
 from spherloc.types import FloatArray

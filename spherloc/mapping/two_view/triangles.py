@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spherloc.geometry import tangent_basis
-from spherloc.mapping.level_pairs import chance_of_fit, fitting, log10_nfa
+from spherloc.mapping.two_view.level_pairs import chance_of_fit, fitting, log10_nfa
 from spherloc.types import FloatArray
 
 Pair = tuple[int, int]

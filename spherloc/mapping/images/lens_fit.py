@@ -20,9 +20,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.mapping.image_circle import Circle
+from spherloc.mapping.images.image_circle import Circle
 from spherloc.mapping.parallel import Tell, as_completed
-from spherloc.mapping.telling import far_rotation, unmoved
+from spherloc.mapping.two_view.telling import far_rotation, unmoved
 from spherloc.types import BoolArray, FloatArray, IntArray
 
 PixelPairs = tuple[FloatArray, FloatArray]

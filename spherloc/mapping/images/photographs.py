@@ -19,9 +19,9 @@ from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
 from spherloc.images import DamagedImageError, check_image
 from spherloc.mapping.advice import advice
-from spherloc.mapping.frames import MAX_IMAGES, FrameChoice, ImageFolder, chosen
-from spherloc.mapping.full_panorama import full_panoramas, near_two_to_one
-from spherloc.mapping.lens import for_colmap
+from spherloc.mapping.images.frames import MAX_IMAGES, FrameChoice, ImageFolder, chosen
+from spherloc.mapping.images.full_panorama import full_panoramas, near_two_to_one
+from spherloc.mapping.images.lens import for_colmap
 from spherloc.trajectory import NS_PER_S
 
 MIN_IMAGES = 2

@@ -18,10 +18,10 @@ from spherloc.errors import ProblemError
 from spherloc.estimators import default_options, estimate
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN, transform
-from spherloc.mapping.model import Reconstruction, SeenPoints, contradictions, points_of
+from spherloc.mapping.alignment.upright import Level, arbitrary_scale
+from spherloc.mapping.models.model import Reconstruction, SeenPoints, contradictions, points_of
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.rig import expected_poses, shots_of
-from spherloc.mapping.upright import Level, arbitrary_scale
 from spherloc.outcome import Outcome, judge
 from spherloc.problem import Problem
 from spherloc.registry import require

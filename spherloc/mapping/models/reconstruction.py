@@ -27,16 +27,16 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
-from spherloc.mapping.joining import joined_by_pairs
-from spherloc.mapping.later import with_images
-from spherloc.mapping.matched import Matched, Names, match_all
-from spherloc.mapping.misplaced import fits, without_misplaced
-from spherloc.mapping.model import Reconstruction, parted, registered, untangled, worth
-from spherloc.mapping.pair_evidence import PairEvidence
-from spherloc.mapping.pairs import MIN_MATCHES
+from spherloc.mapping.alignment.upright import level_of
+from spherloc.mapping.models.joining import joined_by_pairs
+from spherloc.mapping.models.later import with_images
+from spherloc.mapping.models.misplaced import fits, without_misplaced
+from spherloc.mapping.models.model import Reconstruction, parted, registered, untangled, worth
+from spherloc.mapping.models.pair_evidence import PairEvidence
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.rig import Shots, joint_of, one_camera, shots_of, went_apart, with_ties
-from spherloc.mapping.upright import level_of
+from spherloc.mapping.two_view.matched import Matched, Names, match_all
+from spherloc.mapping.two_view.pairs import MIN_MATCHES
 from spherloc.registry import require
 from spherloc.types import FloatArray
 

@@ -15,8 +15,8 @@ from spherloc.datasets.map_scene import DEFAULT_THRESHOLDS
 from spherloc.errors import InputError
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre, inverse_pose, pose, rotation_angle
-from spherloc.mapping.positions import MIN_POSITIONS, SimilarityFit, overlaid
-from spherloc.mapping.sequence import SensorTruth, readable_truths, shots_of_sequence
+from spherloc.mapping.alignment.positions import MIN_POSITIONS, SimilarityFit, overlaid
+from spherloc.mapping.alignment.sequence import SensorTruth, readable_truths, shots_of_sequence
 from spherloc.types import FloatArray
 
 MAX_OFF_DEG, MAX_OFF_M = DEFAULT_THRESHOLDS[1]

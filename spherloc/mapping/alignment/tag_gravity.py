@@ -15,8 +15,8 @@ from spherloc.errors import InputError
 from spherloc.frontend.gravity_from_lines import gravity_from_lines
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN
+from spherloc.mapping.alignment.stated_gravity import BOUND_RAD, StatedGravity
 from spherloc.mapping.parallel import Tell, as_completed
-from spherloc.mapping.stated_gravity import BOUND_RAD, StatedGravity
 from spherloc.types import FloatArray
 
 MIN_LEAN_RAD = float(np.radians(1.5))

@@ -11,9 +11,12 @@ from spherloc.frontend.masks import Masks
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.mapping.advice import advice
-from spherloc.mapping.model import Reconstruction
-from spherloc.mapping.new_images import NewImages
-from spherloc.mapping.scene_files import (
+from spherloc.mapping.alignment.stated_gravity import StatedGravity
+from spherloc.mapping.alignment.true_poses import AlignedTruth, aligned_truth
+from spherloc.mapping.alignment.upright import Level, MapScale, upright_frame
+from spherloc.mapping.models.model import Reconstruction
+from spherloc.mapping.scenes.new_images import NewImages
+from spherloc.mapping.scenes.scene_files import (
     GRAVITY,
     MODEL,
     SCENE,
@@ -27,9 +30,6 @@ from spherloc.mapping.scene_files import (
     write_gravity,
     write_new_scene,
 )
-from spherloc.mapping.stated_gravity import StatedGravity
-from spherloc.mapping.true_poses import AlignedTruth, aligned_truth
-from spherloc.mapping.upright import Level, MapScale, upright_frame
 from spherloc.registry import require
 from spherloc.types import FloatArray
 

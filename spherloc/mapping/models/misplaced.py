@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from spherloc.geometry import camera_centre, rotation_angle
-from spherloc.mapping.model import Reconstruction
+from spherloc.mapping.models.model import Reconstruction
 from spherloc.types import FloatArray
 
 TURNED_RAD = float(np.radians(8.0))

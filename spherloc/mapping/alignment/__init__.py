@@ -1,0 +1,1 @@
+"""Gravity, scale and positions: from stated measurements, lines, sequences and calibrated rigs."""

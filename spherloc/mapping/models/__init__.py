@@ -1,0 +1,1 @@
+"""Models of many images: made by COLMAP, joined, checked for misplaced images, and kept."""
