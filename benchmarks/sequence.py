@@ -21,6 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.errors import InputError
 from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.mapping.alignment.positions import SimilarityFit, overlaid
 from spherloc.mapping.alignment.rig_scale import fixed_images, scale_by_rig
@@ -148,8 +149,13 @@ def main() -> None:
         f"positions {100 * np.median(fit.off_m):.1f} cm (median), down {np.median(leans):.2f}°, "
         f"scale {100 * (1.0 / fit.scale - 1.0):+.2f} %, {seconds:.0f} s"
     )
-    rig = scale_by_rig(mapped, fixed)
-    print(f"without ground truth: {rig.source}; it is off by {100 * (rig.metres_per_unit / fit.scale - 1.0):+.2f} %")
+    try:
+        rig = scale_by_rig(mapped, fixed)
+        print(
+            f"without ground truth: {rig.source}; it is off by {100 * (rig.metres_per_unit / fit.scale - 1.0):+.2f} %"
+        )
+    except InputError as error:
+        print(f"without ground truth: {error}")
     if made.written.truth is not None:
         print(truth_words(made.written.truth))
         print(true_poses_off(made.written.truth.poses, truth, fit))

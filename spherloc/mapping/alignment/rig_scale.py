@@ -2,7 +2,12 @@
 car with several fisheyes.
 
 Images that were taken together stand to each other as their cameras do, so that the distance of two of them in the map
-is known in metres. A single distance is as inexact as the two poses; many of them are not.
+is known in metres. A single distance is as inexact as the two poses; many of them are not, but for what is off by the
+same at all times, such as the calibration.
+
+To turn a camera a little looks in its image nearly as if it were shifted. Where a map has two cameras turned against
+each other otherwise than they are fixed, it has them shifted, too: by the cross product of that turn with where the
+points are that they see. This lever is fitted with the scale, as else a tenth of a degree may falsify it by per cents.
 """
 
 from collections import Counter
@@ -12,6 +17,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import load_camera
@@ -22,7 +28,7 @@ from spherloc.datasets.query_gravity import time_of
 from spherloc.errors import CalibrationError, InputError, shorten
 from spherloc.files import names_in
 from spherloc.frontend.view import View
-from spherloc.geometry import camera_centre, rotation_angle
+from spherloc.geometry import camera_centre
 from spherloc.mapping.advice import advice
 from spherloc.mapping.alignment.positions import MAX_SCALE_SD, NEAR_SD
 from spherloc.mapping.alignment.sequence import shots_of_sequence
@@ -44,6 +50,10 @@ ALIKE = 1.2
 """A scale that differs by a larger factor is in doubt."""
 MAX_OFF = 3.0
 """A relative standard deviation that is larger tells nothing."""
+MIN_FOR_LEVER = 6
+"""Least number of times from which on a lever is fitted."""
+LEVER_SD = 100.0
+"""What is known of the lever: a standard deviation in distances of the cameras."""
 ROUNDS = 10
 """Number of times that the scale is fitted to what fits it."""
 
@@ -175,8 +185,8 @@ def scale_by_rig(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScal
         raise InputError(f"{none}: at {len(times)} times images of two cameras are in the map, {MIN_TIMES} are needed.")
     pairs = [pair for names in times for pair in combinations(names, 2)]
     between = [_between(poses, fixed.body_from_camera, pair) for pair in pairs]
-    stated, mapped = (np.array([one[k] for one in between]) for k in (0, 1))
-    turned_rad = np.array([one[2] for one in between])
+    stated, mapped, turns = (np.array([one[k] for one in between]) for k in range(3))
+    turned_rad = np.linalg.norm(turns, axis=1)
     lengths_m = np.linalg.norm(stated, axis=1)
     if lengths_m.max() > MAX_BASELINE_M:
         metres = "give the positions in its transforms in metres, not in millimetres"
@@ -186,11 +196,11 @@ def scale_by_rig(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScal
         off_deg = np.degrees(np.median(turned_rad))
         otherwise = f"in the map the cameras are turned against each other {off_deg:.0f}° otherwise than it says"
         raise InputError(f"{none}: {otherwise}, or it has them in one place; {advice('other scale')}.")
-    stated, mapped = stated[alike], mapped[alike]
-    units, relative = _units_per_metre(stated, mapped)
+    stated, mapped, turns = stated[alike], mapped[alike], turns[alike]
+    units, scattered, steady = _units_per_metre(stated, mapped, turns if len(times) >= MIN_FOR_LEVER else None)
     # Of three images that were taken together the third distance tells nothing new, and few times tell little.
     free = sum(len(names) - 1 for names in times)
-    relative *= float(np.sqrt(len(pairs) / free)) * (1.0 + 5.0 / (len(times) - 1))
+    relative = float(np.sqrt(len(pairs) / free)) * max(scattered * (1.0 + 5.0 / (len(times) - 1)), steady)
     lengths_m = np.linalg.norm(stated, axis=1)
     shortest, longest = (f"{length_m:.2g}" for length_m in (lengths_m.min(), lengths_m.max()))
     apart = f"{shortest} m" if shortest == longest else f"{shortest} to {longest} m"
@@ -219,28 +229,46 @@ def doubt_of_scale(poses: Mapping[str, FloatArray], scale: MapScale, fixed: Fixe
 
 def _between(
     poses: Mapping[str, FloatArray], body_from_camera: Mapping[str, FloatArray], pair: tuple[str, str]
-) -> tuple[FloatArray, FloatArray, float]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The second image's position from the first one's in the frame of the body: as the calibration states it (3,), m,
-    and in the map (3,), in its units; and the angle, rad, between the frames of the body that the images tell."""
+    and in the map (3,), in its units; and the turn (3,), rad, between the frames of the body that the images tell."""
     (first, second), (here, there) = ([known[name] for name in pair] for known in (body_from_camera, poses))
     turns = first[:3, :3] @ here[:, :3], second[:3, :3] @ there[:, :3]
     way = camera_centre(there) - camera_centre(here)
-    return second[:3, 3] - first[:3, 3], 0.5 * (turns[0] + turns[1]) @ way, rotation_angle(turns[0] @ turns[1].T)
+    return (
+        second[:3, 3] - first[:3, 3],
+        0.5 * (turns[0] + turns[1]) @ way,
+        Rotation.from_matrix(turns[1] @ turns[0].T).as_rotvec(),
+    )
 
 
-def _units_per_metre(stated: FloatArray, mapped: FloatArray) -> tuple[float, float]:
-    """The factor by which ``mapped`` (K, 3) are longer than ``stated`` (K, 3), and its relative standard deviation;
-    infinite if it is not positive.
+def _units_per_metre(stated: FloatArray, mapped: FloatArray, turns: FloatArray | None) -> tuple[float, float, float]:
+    """The factor by which ``mapped`` (K, 3) are longer than ``stated`` (K, 3), and its relative standard deviation: by
+    errors that differ between times, and by what is left of them in the mean of each pair of cameras, as errors that
+    are alike at all times leave it; infinite if it is not positive.
 
     Lengths would make it too large where positions are noisy, so that it is that of the parts along ``stated``. It is
-    fitted to those that fit the median.
+    fitted to those that fit the median, with a lever of the ``turns`` (K, 3), rad, if these are given.
     """
     squares = np.sum(stated**2, axis=1)
-    factors = np.sum(stated * mapped, axis=1) / squares
-    factor = float(np.median(factors))
+    found = np.array([np.median(np.sum(stated * mapped, axis=1) / squares)])  # and the lever, in units of the map
+    parts = stated[:, :, None]
+    if turns is not None:
+        found = np.append(found, np.zeros(3))
+        parts = np.dstack([stated, np.cross(turns[:, None], np.eye(3)).transpose(0, 2, 1)])
+    known = np.zeros(len(found))  # what is known of each, as the weight of a measurement
     for _ in range(ROUNDS):
-        off = np.linalg.norm(mapped - factor * stated, axis=1)
+        off = np.linalg.norm(mapped - parts @ found, axis=1)
         near = off <= NEAR_SD * np.median(off)
-        factor = float(np.sum(factors[near] * squares[near]) / np.sum(squares[near]))
-    sd = float(np.median(off)) / PER_SD / float(np.sqrt(np.sum(squares[near])))
-    return factor, sd / factor if factor > 0.0 else np.inf
+        sd = float(np.median(off)) / PER_SD
+        known[1:] = (sd / (LEVER_SD * abs(found[0]) * np.sqrt(np.median(squares)))) ** 2 if found[0] else 0.0
+        inverse = np.linalg.pinv(np.einsum("kij,kil->jl", parts[near], parts[near]) + np.diag(known))
+        found = inverse @ np.einsum("kij,ki->j", parts[near], mapped[near])
+    factor = float(found[0])
+    if factor <= 0.0:
+        return factor, np.inf, np.inf
+    cameras, pair = np.unique(stated[near], axis=0, return_inverse=True)  # a row for each pair of cameras
+    left = (mapped - parts @ found)[near]
+    means = np.array([left[pair == k].mean(axis=0) for k in range(len(cameras))])
+    steady_sd = float(np.sqrt(np.sum(means**2) / (means.size - 1) / np.sum(cameras**2)))
+    return factor, sd * float(np.sqrt(inverse[0, 0])) / factor, steady_sd / factor
