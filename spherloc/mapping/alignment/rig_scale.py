@@ -115,7 +115,8 @@ def _placed(path: Path, rig: RigCalibration, views: Sequence[View]) -> dict[str,
             called = sorted((name for name in called if _says(view.name, name)), key=len)[-1:]
         if len(called) == 1:
             found[view.name] = (called[0], rig.body_from_camera[called[0]])
-    return {name: one for name, one in found.items() if name not in _of_several(found)}
+    wrong = _of_several(found)
+    return {name: one for name, one in found.items() if name not in wrong}
 
 
 def _of_several(placed: Mapping[str, tuple[str, FloatArray]]) -> set[str]:
