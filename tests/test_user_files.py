@@ -137,9 +137,9 @@ OWN_FILES = {
     "worlds.render",
     "disk_cache",
     "datasets.scene_file",
-    "mapping.matched",
-    "mapping.reconstruction",
-    "mapping.later",
+    "mapping.two_view.matched",
+    "mapping.models.reconstruction",
+    "mapping.models.later",
 }
 """Those that open what spherloc itself wrote or brings: the fifth its own scenes, the last three their database."""
 

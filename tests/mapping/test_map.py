@@ -598,7 +598,7 @@ def test_a_job_tells_what_went_wrong_in_a_line(tmp_path, rng, capsys):
 def test_what_a_map_says_on_the_page_names_no_options(walk):
     """Errors, remarks and the summary: all words about options are those of ``advice``."""
     assert PAGE.keys() == COMMAND.keys() and not [words for words in PAGE.values() if "--" in words]
-    sources = [path for path in Path(make_map.__code__.co_filename).parent.glob("*.py") if path.name != "advice.py"]
+    sources = [path for path in Path(make_map.__code__.co_filename).parent.rglob("*.py") if path.name != "advice.py"]
     assert len(sources) > 10 and not [path for path in sources if re.search(r"--[a-z]", path.read_text("utf-8"))]
     _, found, made, *_ = walk
     unknown = replace(made, scale=replace(made.scale, source="", why_unknown=""), carried_deg=20.0)
