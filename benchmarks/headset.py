@@ -1,134 +1,163 @@
-"""Maps of rendered fisheyes of a headset that walks through a flat and looks about: a Markdown table.
+"""Rendered images of a headset with four fisheyes, mapped and localized by one command: a Markdown table.
 
-    .venv/bin/python -m benchmarks.headset [apartment:31:rgb ...]    # two minutes each
-    .venv/bin/python -m benchmarks.headset --features sift+aliked    # with the extra ``learned``
-    .venv/bin/python -m benchmarks.headset --pairs                   # right and wrong pairs by how sure they are
+    .venv/bin/python -m benchmarks.headset [apartment:8:-13 street:2:13 ...] [--data FOLDER]   # a minute or more each
 
-A world, its seed and a lens are one row: ``rgb`` sees 66 degrees from its axis to the edge of the image, ``slam`` 76 by
-57. The head turns 45 degrees to either side and nods (standard deviations of 45 and 9 degrees), and the images differ
-in exposure, colour, sharpness and noise. Maps are compared with the truth as by ``benchmarks.maps``. Needs the extra
-``colmap``.
+Lenses, and how the cameras are fixed to each other, are those of the real headset whose problems lie in ``--data``. A
+world, its seed, and the angle in degrees by which the head turns from one time to the next are one row: at nine times,
+0.1 s and 5.5 cm apart, the four cameras take an image each. ``spherloc map`` gets those of six times, a calibration
+and, as new images, those of the three times in the middle. Positions and rotations are compared with the truth after
+the similarity that fits the images of the map best. Needs the extra ``colmap``.
 """
 
 import argparse
 import json
-from itertools import combinations, pairwise
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
-import pycolmap
 from scipy.spatial.transform import Rotation
 
-from benchmarks.maps import cells, uneven
-from spherloc.cameras.kannala_brandt import KannalaBrandt
-from spherloc.frontend.features import extract
-from spherloc.geometry import camera_centre, pose, rotation_angle
-from spherloc.mapping.images.photographs import photographs
-from spherloc.mapping.parallel import as_completed
-from spherloc.mapping.two_view.level_pairs import fitting
-from spherloc.mapping.two_view.pairs import SURE, ImagePairs, relative
+from spherloc.cameras.fisheye624 import Fisheye624
+from spherloc.datasets.map_scene import MapScene
+from spherloc.datasets.scene_file import load_scene
+from spherloc.experiments.results import LOCALIZED, read_results
+from spherloc.geometry import camera_centre, rotation_angle
 from spherloc.types import FloatArray
 from spherloc.worlds import Conditions, build_world, render
-from spherloc_viz.commands.map import how_of
 
-SETS = tuple(f"apartment:{seed}:{lens}" for seed in (31, 32, 33) for lens in ("rgb", "slam"))
-LENSES = {
-    "rgb": KannalaBrandt(704, 704, 305.0, 305.0, 350.0, 354.0, (0.01, -0.004, 0.001, 0.0)),
-    "slam": KannalaBrandt(640, 480, 241.0, 241.0, 318.0, 242.0, (0.0, 0.0, 0.0, 0.0)),
-}
-COUNT = 36
-YAW_SD_DEG, PITCH_DEG, PITCH_SD_DEG, ROLL_SD_DEG, ASIDE_SD_M, UP_SD_M = 45.0, 8.0, 9.0, 4.0, 0.15, 0.03
-"""Of the head, which is turned down by the second on average."""
-RIGHT_DEG = 3.0, 10.0
-"""A pair is right if its rotation and the direction to the second camera are off by no more."""
-STEPS = (0.0, SURE / 4.0, SURE / 2.0, SURE, 2.0 * SURE, np.inf)
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "aria_gen2"
+ROWS = ("apartment:8:-13", "apartment:3:13", "apartment:11:35", "street:2:13", "campus:4:13")
+TIMES, NEW = 9, (3, 4, 5)
+STEP_NS, EXPOSED_APART_NS, START_NS = 100_000_000, 700_001, 7_385_024_932_864
+MOVE_M = (0.033, 0.003, 0.044)
+"""What the headset moves from one time to the next: to the right, down and ahead."""
+CONDITIONS = Conditions(noise=3.0, motion_blur_px=1.5)
+PLACES = 40
 
 
-def smooth(rng: np.random.Generator, sd: float, reach: int) -> FloatArray:
-    """Random numbers (COUNT,) of which ``2 reach + 1`` neighbours are alike."""
-    weights = np.hanning(2 * reach + 3)[1:-1]
-    numbers = np.convolve(rng.normal(size=COUNT + 2 * reach), weights, "valid")
-    return sd * numbers / np.linalg.norm(weights)
+def headset(data: Path) -> dict[str, tuple[Fisheye624, FloatArray]]:
+    """Lens and ``body_from_camera`` (4, 4) of each camera, by its name; the body is level and looks ahead."""
+    lenses, cam_from_map = {}, {}
+    for path in sorted(data.glob("*.toml")):
+        name = path.stem.rpartition("_")[0]
+        if name not in lenses:
+            problem = load_scene(path).problem(0)
+            assert isinstance(problem.camera, Fisheye624) and problem.truth_cam_from_map is not None
+            lenses[name] = problem.camera
+            cam_from_map[name] = np.vstack([problem.truth_cam_from_map, [0.0, 0.0, 0.0, 1.0]])
+    ahead = np.sum([pose[2, :3] for name, pose in cam_from_map.items() if "front" in name], axis=0)
+    ahead[2] = 0.0  # z of the map is up
+    ahead /= np.linalg.norm(ahead)
+    down = np.array([0.0, 0.0, -1.0])
+    body_from_map = np.eye(4)
+    body_from_map[:3, :3] = [np.cross(down, ahead), down, ahead]
+    body_from_map[:3, 3] = -body_from_map[:3, :3] @ camera_centre(next(iter(cam_from_map.values())))
+    return {name: (lens, body_from_map @ np.linalg.inv(cam_from_map[name])) for name, lens in lenses.items()}
 
 
-def photographed(world: str, seed: int, lens: str, folder: Path) -> dict[str, FloatArray]:
-    """Write the fisheyes with their calibration into a folder; returns their true poses (3, 4) by name."""
-    place, camera, rng = build_world(world, seed), LENSES[lens], np.random.default_rng([seed, len(lens)])
-    turns = np.column_stack(
-        [smooth(rng, ROLL_SD_DEG, 2), PITCH_DEG + smooth(rng, PITCH_SD_DEG, 2), smooth(rng, YAW_SD_DEG, 3)]
-    )
-    moves = np.column_stack([smooth(rng, ASIDE_SD_M, 3), smooth(rng, UP_SD_M, 2), np.zeros(COUNT)])
-    folder.mkdir()
-    said = "\n".join(f"{key} = {json.dumps(value)}" for key, value in camera.to_dict().items())
-    (folder / "camera.toml").write_text(f"[camera]\n{said}\n")
-    poses = {}
-    for number, level in enumerate(place.route(COUNT, start=0.02, stop=0.98)):
-        turn = Rotation.from_euler("ZXY", turns[number], degrees=True).as_matrix()
-        name, found = f"{number:03d}.jpg", pose(turn @ level[:, :3], turn @ (level[:, 3] - moves[number]))
-        image = render(place, camera, found, Conditions(noise=2.0), number, f"headset_{number:03d}").image
-        cv2.imwrite(str(folder / name), uneven(image, rng))
-        poses[name] = found
+def photographed(world: str, seed: int, turn_deg: float, folder: Path, data: Path) -> dict[str, FloatArray]:
+    """Write the images to map, the new ones and the calibration into a folder; returns true poses (3, 4) by name."""
+    cameras, made, poses = headset(data), build_world(world, seed), {}
+    start = np.eye(4)
+    start[:3] = made.route(PLACES, start=0.05, stop=0.95)[seed % PLACES]
+    for kind in ("map", "new"):
+        (folder / kind).mkdir()
+    for k in range(TIMES):
+        moved = np.eye(4)
+        angles = [turn_deg * k, 3.0 * np.sin(0.5 * k), 2.0 * np.sin(0.8 * k + 1.0)]
+        moved[:3, :3] = Rotation.from_euler("yxz", angles, degrees=True).as_matrix()
+        moved[:3, 3] = k * np.array(MOVE_M)
+        for number, (camera, (lens, body_from_camera)) in enumerate(cameras.items()):
+            name = f"{camera}_{START_NS + k * STEP_NS + number * EXPOSED_APART_NS}.png"
+            poses[name] = (np.linalg.inv(moved @ body_from_camera) @ start)[:3]
+            image = render(made, lens, poses[name], CONDITIONS, k, name).image
+            grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+            cv2.imwrite(str(folder / ("new" if k in NEW else "map") / name), grey)
+    (folder / "calibration.json").write_text(json.dumps({name: as_json(*one) for name, one in cameras.items()}))
     return poses
 
 
-def row(one: str, features: str) -> str:
-    """One line of the table."""
-    world, seed, lens = one.split(":")
-    with TemporaryDirectory() as place:
-        folder = Path(place) / "images"
-        poses = photographed(world, int(seed), lens, folder)
-        return f"| {one} | {cells(folder, {name: camera_centre(one) for name, one in poses.items()}, features)}"
+def as_json(lens: Fisheye624, body_from_camera: FloatArray) -> dict[str, object]:
+    """A camera as Project Aria's tools write it, with the centre of the first pixel at (0, 0)."""
+    parameters = [lens.fx, lens.cx - 0.5, lens.cy - 0.5, *lens.distortion]
+    size, transform = [lens.width, lens.height], body_from_camera.tolist()
+    return {"model": "FISHEYE624", "params": parameters, "size": size, "T_device_camera": transform}
 
 
-def sure_pairs(one: str, features: str) -> list[tuple[float, bool]]:
-    """The matches that fit each pair, times the cube of its peak, and whether its pose is right."""
-    world, seed, lens = one.split(":")
-    how, camera = how_of(features), LENSES[lens]
-    with TemporaryDirectory() as place:
-        folder = Path(place) / "images"
-        poses = list(photographed(world, int(seed), lens, folder).values())
-        views = photographs(folder, {}).views
-        found = dict(as_completed(lambda index: extract(views[index], how.features), range(COUNT)))
-    images = [found[index] for index in range(COUNT)]
-    usable = [np.flatnonzero(camera.unproject(image.pixels)[0][:, 2] > 0.1) for image in images]
-    pairs = ImagePairs(pycolmap, [camera] * COUNT, images, usable, [None] * COUNT, how.matching, frozenset())
-    judged = []
-    for (first, second), (matches, geometry) in as_completed(
-        lambda pair: pairs.compare(*pair), list(combinations(range(COUNT), 2))
-    ):
-        if geometry is None or pairs.same_place(geometry):
-            continue
-        rotation, way = relative(geometry)
-        rays = pairs.bearings[first][matches[:, 0]], pairs.bearings[second][matches[:, 1]]
-        count = np.count_nonzero(fitting(*rays, rotation, way, pairs.bound_rad))
-        true = poses[second][:, :3] @ poses[first][:, :3].T
-        true_way = poses[second][:, 3] - true @ poses[first][:, 3]
-        aside = np.degrees(np.arccos(np.clip(way @ true_way / np.linalg.norm(true_way), -1.0, 1.0)))
-        right = np.degrees(rotation_angle(rotation @ true.T)) <= RIGHT_DEG[0] and aside <= RIGHT_DEG[1]
-        judged.append((count * pairs.peak(first, second, (rotation, way)) ** 3, bool(right)))
-    return judged
+def localized(results: Path) -> dict[str, FloatArray]:
+    """Poses (3, 4) of the new images that are localized, by name."""
+    rows = read_results(results).rows
+    return {row.query: row.cam_from_map for row in rows if row.status == LOCALIZED and row.cam_from_map is not None}
 
 
-def main() -> None:
+def aligned(mapped: Mapping[str, FloatArray], poses: Mapping[str, FloatArray]) -> tuple[float, FloatArray, FloatArray]:
+    """Scale, rotation (3, 3) and translation (3,) from the map to the world: by all orientations, as positions that lie
+    close together fix no rotation, and then by all positions."""
+    turns = Rotation.from_matrix([poses[name][:, :3].T @ pose[:, :3] for name, pose in mapped.items()])
+    rotation = turns.mean().as_matrix()
+    found = np.array([camera_centre(pose) for pose in mapped.values()]) @ rotation.T
+    true = np.array([camera_centre(poses[name]) for name in mapped])
+    spread = found - found.mean(axis=0)
+    scale = float(np.sum(spread * (true - true.mean(axis=0))) / np.sum(spread**2))
+    return scale, rotation, true.mean(axis=0) - scale * found.mean(axis=0)
+
+
+def cells(folder: Path, poses: Mapping[str, FloatArray]) -> str:
+    """A row of the table."""
+    words = [Path(sys.executable).with_name("spherloc"), "map", "map", "--camera", "calibration.json"]
+    begin = time.perf_counter()
+    done = subprocess.run([*words, "--localize", "new"], cwd=folder, capture_output=True, text=True)
+    seconds = time.perf_counter() - begin
+    if not (folder / "map_map" / "scene.toml").exists():
+        return f"{done.stderr.strip().splitlines()[-1]} | | | | | | | {seconds:.0f}"
+    scene = load_scene(folder / "map_map" / "scene.toml")
+    assert isinstance(scene, MapScene)
+    mapped = {
+        view.name: view.cam_from_map for view in (*scene.references, *scene.queries) if view.cam_from_map is not None
+    }
+    scale, rotation, shift = aligned(mapped, poses)
+    said = next(line for line in done.stdout.splitlines() if line.startswith("scale")).rpartition("good to ")[2]
+    found = localized(next((folder / "recordings").glob("*/")))
+
+    def off(these: Mapping[str, FloatArray]) -> str:
+        if not these:
+            return " | "
+        centres = scale * np.array([camera_centre(pose) for pose in these.values()]) @ rotation.T + shift
+        off_m = np.linalg.norm(centres - [camera_centre(poses[name]) for name in these], axis=1)
+        turned = [rotation_angle(pose[:, :3] @ rotation.T @ poses[name][:, :3].T) for name, pose in these.items()]
+        return f"{100 * np.median(off_m):.1f} ({100 * off_m.max():.1f}) | {np.degrees(np.median(turned)):.2f}"
+
+    images = len(scene.references) + len(scene.queries), len(found)
+    asked = [len(list((folder / kind).iterdir())) for kind in ("map", "new")]
+    in_map, new = (f"{have} of {count}" for have, count in zip(images, asked, strict=True))
+    known = f"{100 * (1.0 / scale - 1.0):+.1f} ({said})"
+    return f"{in_map} | {off(mapped)} | {known} | {new} | {off(found)} | {seconds:.0f}"
+
+
+def main() -> int:
     """Print the table."""
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("sets", nargs="*", default=SETS, metavar="WORLD:SEED:LENS")
-    words.add_argument("--features", default="sift")
-    words.add_argument("--pairs", action="store_true")
+    words.add_argument("rows", nargs="*", default=ROWS, metavar="WORLD:SEED:DEGREES")
+    words.add_argument("--data", type=Path, default=DATA)
     given = words.parse_args()
-    if given.pairs:
-        found = [pair for one in given.sets for pair in sure_pairs(one, given.features)]
-        print("| matches times the cube of the peak | right pairs | wrong pairs |\n|---|---|---|")
-        for low, high in pairwise(STEPS):
-            some = [right for value, right in found if low <= value < high]
-            print(f"| {low:g} to {high:g} | {sum(some)} | {len(some) - sum(some)} |")
-        return
-    print("| fisheyes | maps of | right | wrong | median of the right ones, cm |\n|---|---|---|---|---|")
-    for one in given.sets:
-        print(row(one, given.features), flush=True)
+    if not given.data.is_dir():
+        print(f"Left out: there is no folder {given.data}.")
+        return 0
+    off = "cm off: median (most) | ° off"
+    print(f"| | in the map | {off} | scale, % off (said) | new images localized | {off} | s |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for row in given.rows:
+        world, seed, turn_deg = row.split(":")
+        with TemporaryDirectory() as place:
+            poses = photographed(world, int(seed), float(turn_deg), Path(place), given.data)
+            print(f"| {row} | {cells(Path(place), poses)} |", flush=True)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
