@@ -266,7 +266,7 @@ def _of_folder(
             damaged.append(name)
         except InputError as error:
             refused.append(str(error))
-    remarks = [*_about_damaged(damaged), *_about_refused(refused), *_about_unread(others)]
+    remarks = [*_about_damaged(damaged), *_about_refused(refused), *about_unread(others)]
     if not sizes:
         raise InputError(_without_photographs(folder, remarks, of_map is not None))
     cameras = given or {
@@ -339,6 +339,8 @@ def _of_folder(
             and_so = "; put its calibration into that folder."
         if near_two_to_one((width, height)) and not given and width != 2 * height:
             and_so = f"{and_so[:-1]}; full panoramas are twice as wide as high."
+        if any((one.height, one.width) == (width, height) for one in camera_of.values()):
+            and_so = ", on its side: orientation tags are not used, so store it as the others are."
         remarks.append(
             f"{len(rest)} of {len(rest) + len(camera_of)} images were left out, as their camera is not known; the "
             f"first is {shorten(rest[0])} with {width} x {height} pixels{and_so}"
@@ -475,7 +477,8 @@ def _about_raw(names: Sequence[str]) -> list[str]:
     ]
 
 
-def _about_unread(names: Sequence[str]) -> list[str]:
+def about_unread(names: Sequence[str]) -> list[str]:
+    """A remark on photographs in formats that are not read, among files with these names; empty without any."""
     unread = [name for name in names if Path(name).suffix.lower() in UNREAD and not name.startswith(".")]
     if not unread:
         return []
