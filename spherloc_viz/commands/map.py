@@ -309,7 +309,8 @@ def _take_frames(video: Path, count: int, folder: Path, tell: Tell) -> None:
         taken.append(name)
         tell("frames taken from the video", len(taken), count)
 
-    frames_of(video, folder, count, another)
+    for remark in frames_of(video, folder, count, another):
+        say(remark)
     others = [name for name in names_in(folder) if is_image(name) and name not in taken]
     if others:
         say(f"{folder}: has {len(others)} more images, such as {shorten(others[0])}, which are mapped with the frames.")

@@ -512,6 +512,11 @@ def test_each_image_of_a_rig_has_its_camera(tmp_path, rng):
         "The calibration found beside them: slam_left, slam_right.",
         "1 of 4 images were left out, as their camera is not known; the first is else.png with 400 x 300 pixels.",
     )
+    picture(flat / "at_hand.png", 300, 400, rng)
+    assert photographs(flat, {}).remarks[1] == (
+        "2 of 5 images were left out, as their camera is not known; the first is at_hand.png with 300 x 400 pixels, on "
+        "its side: orientation tags are not used, so store it as the others are."
+    )
 
 
 SENSORS = """# kapture format: 1.1
@@ -735,6 +740,15 @@ def test_images_that_show_nothing_together(tmp_path, rng):
     assert not (tmp_path / "map").exists(), "a map that cannot be made leaves nothing"
 
 
+def test_black_images_are_told_as_such(tmp_path, rng):
+    picture(tmp_path / "a.png", 400, 200, rng)
+    for name in ("b.png", "c.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((200, 400), np.uint8))
+    views = photographs(tmp_path, {}, panorama=True).views
+    with pytest.raises(InputError, match=r"^2 of the 3 photographs, such as b\.png, show hardly anything"):
+        make_map(MapRequest(views, tmp_path), tmp_path / "map")
+
+
 def test_a_map_that_cannot_be_made_leaves_what_was_there(tmp_path, rng):
     """A finished map and a file of the user's; but not the matches of an attempt that was stopped."""
     for name in ("a.png", "b.png"):
@@ -835,11 +849,15 @@ def test_frames_of_a_video_are_its_sharpest(tmp_path, rng, capsys):
         writer.write(sharp if number % 4 == 2 else np.asarray(cv2.GaussianBlur(sharp, (0, 0), 3.0), np.uint8))
     writer.release()
     names = []
-    assert frames_of(video, tmp_path, 3, names.append) == 3
+    assert frames_of(video, tmp_path, 3, names.append) == []
     assert names == ["frame_000002.jpg", "frame_000006.jpg", "frame_000010.jpg"]
     _take_frames(video, 1, tmp_path, lambda *_: None)
     said = "has 2 more images, such as frame_000006.jpg, which are mapped with the frames."
     assert said in capsys.readouterr().err, "one of the three is taken again"
+    content = video.read_bytes()
+    video.write_bytes(content[: len(content) // 2])
+    (remark,) = frames_of(video, tmp_path, 3, names.append)
+    assert re.search(r"only the first [5-8] of its 12 frames can be read, of which 2 were taken; copy", remark)
     (tmp_path / "text.mp4").write_text("no video")
     with pytest.raises(InputError, match="cannot read it as a video"):
         frames_of(tmp_path / "text.mp4", tmp_path / "frames", 3, names.append)
