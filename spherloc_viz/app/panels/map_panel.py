@@ -97,7 +97,8 @@ class MapPanel:
             self._process, stopped = None, self._stopped
         self._bar.visible = self._stop.visible = False
         if "scene" in said:
-            self._told = box(_table(said["summary"]), "font-size:12px;overflow-wrap:anywhere")
+            title = f"<div style='font-weight:600'>The map of {escape(folder.name)}</div>"
+            self._told = box(title + _table(said["summary"]), "font-size:12px;overflow-wrap:anywhere")
             self._text.content, self._report, self._save.visible = self._told, Path(said["report"]), True
             self._finished(Path(said["scene"]))
         elif stopped:
