@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from spherloc import registry
@@ -660,6 +661,18 @@ def test_photographs_that_are_refused_or_left_out(tmp_path, rng):
     (tmp_path / "c.png").rename(tmp_path / "c.heic")
     with pytest.raises(InputError, match=r"has 1 photograph with .* convert \.heic to JPEG or PNG\. 4 of 5 images"):
         photographs(tmp_path, {})
+
+
+def test_panoramas_that_programs_show_turned_are_told(tmp_path, rng):
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        picture(tmp_path / name, 400, 200, rng)
+    for name, orientation in (("a.jpg", 1), ("b.jpg", 3)):
+        tags = Image.Exif()
+        tags[0x0112] = orientation
+        with Image.open(tmp_path / name) as image:
+            image.save(tmp_path / name, exif=tags)
+    (remark,) = photographs(tmp_path, {}, panorama=True).remarks
+    assert remark.startswith("1 panorama has an orientation tag, which is not used: b.jpg; where pixels are upside")
 
 
 def test_nothing_in_a_folder_of_a_stranger_is_left_out_in_silence(tmp_path, rng):

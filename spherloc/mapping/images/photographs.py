@@ -17,7 +17,7 @@ from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
-from spherloc.images import DamagedImageError, check_image
+from spherloc.images import DamagedImageError, check_image, is_turned
 from spherloc.mapping.advice import advice
 from spherloc.mapping.images.frames import MAX_IMAGES, FrameChoice, ImageFolder, chosen
 from spherloc.mapping.images.full_panorama import full_panoramas, near_two_to_one
@@ -345,6 +345,8 @@ def _of_folder(
             f"{len(rest)} of {len(rest) + len(camera_of)} images were left out, as their camera is not known; the "
             f"first is {shorten(rest[0])} with {width} x {height} pixels{and_so}"
         )
+    full = [name for name, camera in camera_of.items() if isinstance(camera, Equirectangular)]
+    remarks += _about_turned(sorted(name for name in full if is_turned(folder / name)))
     for_model: dict[str, Camera] = {}
     for camera in camera_of.values():
         if repr(camera) not in for_model:
@@ -474,6 +476,18 @@ def _about_raw(names: Sequence[str]) -> list[str]:
     return [
         f"{_were(len(names), 'image')} left out, two fisheye circles side by side and no panorama: {_some(names)}; "
         f"{advice('two circles')}."
+    ]
+
+
+def _about_turned(names: Sequence[str]) -> list[str]:
+    """A remark on panoramas that programs show turned. That of other images is right: calibrations are of the pixels
+    as they are stored."""
+    if not names:
+        return []
+    have = f"{_counted(len(names), 'panorama')} {'has' if len(names) == 1 else 'have'}"
+    return [
+        f"{have} an orientation tag, which is not used: {_some(names)}; where pixels are upside down without it, save "
+        "them turned."
     ]
 
 
