@@ -24,6 +24,11 @@ MAX_PIXELS = 150_000_000
 USED_BITS = (8, 10, 12, 16)
 """How many bits of 16 cameras use. Of 16 bits that stop below 12 hardly anything could be seen."""
 
+ORIENTATION = 0x0112
+"""EXIF's tag of how to turn the pixels: 1 for not at all, up to 8."""
+HEIF = tuple(b"ftyp" + brand for brand in (b"heic", b"heix", b"hevc", b"mif1", b"avif"))
+"""How files of HEIC and AVIF begin, after four bytes; a photograph that was sent or copied may be one named .jpg."""
+
 
 class DamagedImageError(InputError):
     """A file that can be read holds no image, or not all of one."""
@@ -57,6 +62,16 @@ def read_size(path: Path) -> tuple[int, int]:
     path = Path(path)
     with reading(path, "correct the path of the image"), open_file(path) as file:
         return _size(file, path)
+
+
+def is_turned(path: Path) -> bool:
+    """Whether a photograph has an orientation tag by which programs show it turned or mirrored; tags of PNGs, for which
+    all of it would be decoded, are not looked for."""
+    try:
+        with warnings.catch_warnings(action="ignore"), open_file(path) as file, Image.open(file) as image:
+            return image.format != "PNG" and image.getexif().get(ORIENTATION, 1) in range(2, 9)
+    except Exception:  # Pillow passes on whatever a damaged tag raises
+        return False
 
 
 def check_image(path: Path) -> tuple[int, int]:
@@ -132,6 +147,9 @@ def _size(file: BinaryIO, path: Path) -> tuple[int, int]:
     except Exception:  # Pillow's readers pass on whatever a damaged header raises
         if path.suffix.lower() in (".tif", ".tiff"):  # Pillow lacks kinds such as colours in floating-point numbers
             raise InputError(f"{path}: is damaged, or a TIFF of a kind that is not read; save it as PNG.") from None
+        file.seek(0)
+        if file.read(12)[4:] in HEIF:
+            raise InputError(f"{path}: is HEIC or AVIF, whatever its name says; convert it to JPEG or PNG.") from None
         raise DamagedImageError(f"{path}: not an image that can be read, or a damaged one; replace it.") from None
     if not 0 < width * height <= MAX_PIXELS:
         raise InputError(f"{path}: claims 0 pixels or more than {MAX_PIXELS:,}; give a smaller image.")

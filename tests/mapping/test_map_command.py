@@ -5,6 +5,8 @@ import os
 import subprocess
 import sys
 
+import cv2
+import numpy as np
 import pytest
 from image_samples import picture
 
@@ -49,6 +51,15 @@ def test_images_that_show_nothing_together(tmp_path, rng):
     with pytest.raises(InputError, match=r"no two of the 2 photographs surely show the same place .*the best pair has"):
         make_map(MapRequest(found.views, tmp_path), tmp_path / "map")
     assert not (tmp_path / "map").exists(), "a map that cannot be made leaves nothing"
+
+
+def test_black_images_are_told_as_such(tmp_path, rng):
+    picture(tmp_path / "a.png", 400, 200, rng)
+    for name in ("b.png", "c.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((200, 400), np.uint8))
+    views = photographs(tmp_path, {}, panorama=True).views
+    with pytest.raises(InputError, match=r"^2 of the 3 photographs, such as b\.png, show hardly anything"):
+        make_map(MapRequest(views, tmp_path), tmp_path / "map")
 
 
 def test_a_map_that_cannot_be_made_leaves_what_was_there(tmp_path, rng):

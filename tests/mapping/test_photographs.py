@@ -1,6 +1,7 @@
 """Which files of a folder are photographs, of which camera, and what is said of the others."""
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from image_samples import camera_file, picture
+from PIL import Image
 
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kannala_brandt import KannalaBrandt
@@ -139,6 +141,11 @@ def test_each_image_of_a_rig_has_its_camera(tmp_path, rng):
         "The calibration found beside them: slam_left, slam_right.",
         "1 of 4 images were left out, as their camera is not known; the first is else.png with 400 x 300 pixels.",
     )
+    picture(flat / "at_hand.png", 300, 400, rng)
+    assert photographs(flat, {}).remarks[1] == (
+        "2 of 5 images were left out, as their camera is not known; the first is at_hand.png with 300 x 400 pixels, on "
+        "its side: orientation tags are not used, so store it as the others are."
+    )
 
 
 SENSORS = """# kapture format: 1.1
@@ -199,6 +206,18 @@ def test_photographs_that_are_refused_or_left_out(tmp_path, rng):
     (tmp_path / "c.png").rename(tmp_path / "c.heic")
     with pytest.raises(InputError, match=r"has 1 photograph with .* convert \.heic to JPEG or PNG\. 4 of 5 images"):
         photographs(tmp_path, {})
+
+
+def test_panoramas_that_programs_show_turned_are_told(tmp_path, rng):
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        picture(tmp_path / name, 400, 200, rng)
+    for name, orientation in (("a.jpg", 1), ("b.jpg", 3)):
+        tags = Image.Exif()
+        tags[0x0112] = orientation
+        with Image.open(tmp_path / name) as image:
+            image.save(tmp_path / name, exif=tags)
+    (remark,) = photographs(tmp_path, {}, panorama=True).remarks
+    assert remark.startswith("1 panorama has an orientation tag, which is not used: b.jpg; where pixels are upside")
 
 
 def test_nothing_in_a_folder_of_a_stranger_is_left_out_in_silence(tmp_path, rng):
@@ -272,11 +291,15 @@ def test_frames_of_a_video_are_its_sharpest(tmp_path, rng, capsys):
         writer.write(sharp if number % 4 == 2 else np.asarray(cv2.GaussianBlur(sharp, (0, 0), 3.0), np.uint8))
     writer.release()
     names = []
-    assert frames_of(video, tmp_path, 3, names.append) == 3
+    assert frames_of(video, tmp_path, 3, names.append) == []
     assert names == ["frame_000002.jpg", "frame_000006.jpg", "frame_000010.jpg"]
     _take_frames(video, 1, tmp_path, lambda *_: None)
     said = "has 2 more images, such as frame_000006.jpg, which are mapped with the frames."
     assert said in capsys.readouterr().err, "one of the three is taken again"
+    content = video.read_bytes()
+    video.write_bytes(content[: len(content) // 2])
+    (remark,) = frames_of(video, tmp_path, 3, names.append)
+    assert re.search(r"only the first [5-8] of its 12 frames can be read, of which 2 were taken; copy", remark)
     (tmp_path / "text.mp4").write_text("no video")
     with pytest.raises(InputError, match="cannot read it as a video"):
         frames_of(tmp_path / "text.mp4", tmp_path / "frames", 3, names.append)

@@ -29,6 +29,8 @@ FFMPEG_LEVEL = "OPENCV_FFMPEG_LOGLEVEL"
 MAX_WHOLE, MAX_STEP_S = 100, 0.5
 """A camera that took more than ``MAX_WHOLE`` images, by the times in their names one every ``MAX_STEP_S`` seconds or
 more often (median), recorded a sequence, of which images are chosen."""
+WHOLE = 0.9
+"""Smallest share of the frames that a whole video has of those that it says to have, which may be an estimate."""
 SHARPNESS_PX = 512
 """Images are scaled to this longer side before their sharpness is compared."""
 MAX_COMPARED = 20
@@ -190,8 +192,8 @@ def _about(
     return f"{taken:,} of {there:,} images are mapped{which}, the sharpest of each stretch; {more}."
 
 
-def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], None]) -> int:
-    """Write about ``count`` frames of a video into ``folder``, which is made, and return their number.
+def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], None]) -> list[str]:
+    """Write about ``count`` frames of a video into ``folder``, which is made, and return a remark if it ends early.
 
     The video is divided into equal pieces, of which the sharpest frame each is written. ``advance`` is called after
     each frame with its file name. Existing frames are not written again. Raises ``InputError`` if the video cannot be
@@ -209,8 +211,8 @@ def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], No
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); give another folder.") from None
     stretch = max(1, ceil(total / count))
-    written = 0
-    for number, frame in _sharpest(reader, stretch):
+    written = read = 0
+    for number, frame, end in _sharpest(reader, stretch):
         name = f"frame_{number:06d}.jpg"
         path = folder / name
         if not is_file(path):
@@ -219,9 +221,16 @@ def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], No
                 write_whole(path, content.tobytes() if done else b"")
             except OSError as error:
                 raise InputError(f"{path}: cannot be written ({error.strerror}); give another folder.") from None
-        written += 1
+        written, read = written + 1, end
         advance(name)
-    return written
+    if not written:
+        raise InputError(f"{video}: OpenCV can read none of its {total:,} frames; copy it again, or convert it.")
+    if read >= WHOLE * total:
+        return []
+    return [
+        f"{video}: only the first {read:,} of its {total:,} frames can be read, of which {written:,} were taken; copy "
+        "it again, or convert it, to have frames of the rest."
+    ]
 
 
 @contextmanager
@@ -238,14 +247,14 @@ def _without_lines_of_ffmpeg() -> Iterator[None]:
         os.environ.pop(FFMPEG_LEVEL, None)
 
 
-def _sharpest(reader: cv2.VideoCapture, stretch: int) -> Iterator[tuple[int, ByteArray]]:
-    """Number and pixels of the sharpest frame of each ``stretch`` frames."""
+def _sharpest(reader: cv2.VideoCapture, stretch: int) -> Iterator[tuple[int, ByteArray, int]]:
+    """Number and pixels of the sharpest frame of each ``stretch`` frames, and how many were read until then."""
     best: tuple[float, int, ByteArray] | None = None
     number = 0
     while True:
         there, frame = reader.read()
         if best is not None and (not there or number % stretch == 0):
-            yield best[1], best[2]
+            yield best[1], best[2], number
             best = None
         if not there:
             return

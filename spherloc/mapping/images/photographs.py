@@ -17,7 +17,7 @@ from spherloc.errors import InputError, SpherlocError, shorten
 from spherloc.files import IMAGES, is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
-from spherloc.images import DamagedImageError, check_image
+from spherloc.images import DamagedImageError, check_image, is_turned
 from spherloc.mapping.advice import advice
 from spherloc.mapping.images.frames import MAX_IMAGES, FrameChoice, ImageFolder, chosen
 from spherloc.mapping.images.full_panorama import full_panoramas, near_two_to_one
@@ -266,7 +266,7 @@ def _of_folder(
             damaged.append(name)
         except InputError as error:
             refused.append(str(error))
-    remarks = [*_about_damaged(damaged), *_about_refused(refused), *_about_unread(others)]
+    remarks = [*_about_damaged(damaged), *_about_refused(refused), *about_unread(others)]
     if not sizes:
         raise InputError(_without_photographs(folder, remarks, of_map is not None))
     cameras = given or {
@@ -339,10 +339,14 @@ def _of_folder(
             and_so = "; put its calibration into that folder."
         if near_two_to_one((width, height)) and not given and width != 2 * height:
             and_so = f"{and_so[:-1]}; full panoramas are twice as wide as high."
+        if any((one.height, one.width) == (width, height) for one in camera_of.values()):
+            and_so = ", on its side: orientation tags are not used, so store it as the others are."
         remarks.append(
             f"{len(rest)} of {len(rest) + len(camera_of)} images were left out, as their camera is not known; the "
             f"first is {shorten(rest[0])} with {width} x {height} pixels{and_so}"
         )
+    full = [name for name, camera in camera_of.items() if isinstance(camera, Equirectangular)]
+    remarks += _about_turned(sorted(name for name in full if is_turned(folder / name)))
     for_model: dict[str, Camera] = {}
     for camera in camera_of.values():
         if repr(camera) not in for_model:
@@ -475,7 +479,20 @@ def _about_raw(names: Sequence[str]) -> list[str]:
     ]
 
 
-def _about_unread(names: Sequence[str]) -> list[str]:
+def _about_turned(names: Sequence[str]) -> list[str]:
+    """A remark on panoramas that programs show turned. That of other images is right: calibrations are of the pixels
+    as they are stored."""
+    if not names:
+        return []
+    have = f"{_counted(len(names), 'panorama')} {'has' if len(names) == 1 else 'have'}"
+    return [
+        f"{have} an orientation tag, which is not used: {_some(names)}; where pixels are upside down without it, save "
+        "them turned."
+    ]
+
+
+def about_unread(names: Sequence[str]) -> list[str]:
+    """A remark on photographs in formats that are not read, among files with these names; empty without any."""
     unread = [name for name in names if Path(name).suffix.lower() in UNREAD and not name.startswith(".")]
     if not unread:
         return []

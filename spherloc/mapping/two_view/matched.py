@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_models import colmap_camera
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.errors import InputError, StoppedError, reason
+from spherloc.errors import InputError, StoppedError, reason, shorten
 from spherloc.frontend import retrieval
 from spherloc.frontend.features import VERSION, Features, extract
 from spherloc.frontend.pipeline import FrontendOptions
@@ -182,11 +182,21 @@ def _why_none(matched: Matched) -> str:
     """Why no two of the images fit together."""
     count = len(matched.ids)
     if matched.same_place.max(initial=0) >= MIN_MATCHES:
+        pairs = np.count_nonzero(np.triu(matched.same_place))
+        match = f"1 pair of the {count} photographs matches"
+        if pairs > 1:
+            match = f"{pairs} pairs of the {count} photographs match"
         return (
-            f"{np.count_nonzero(np.triu(matched.same_place))} pairs of the {count} photographs match as if all were "
-            "taken from one place. If they were, add photographs from half a metre to two metres away; if not, "
-            "the calibration is wrong, or something moves along and is seen in each, such as a car or a tripod: "
+            f"{match} as if all were taken from one place. If they were, add photographs from half a metre to two "
+            "metres away; if not, the calibration is wrong, or something moves along and is seen in each, such as a "
+            "car or a tripod: "
             f"{advice('moves along')}."
+        )
+    bare = [name for name, bearings in matched.bearings.items() if len(bearings) < MIN_MATCHES]
+    if len(bare) > count - 2:
+        return (
+            f"{len(bare)} of the {count} photographs, such as {shorten(bare[0])}, show hardly anything that can be "
+            "matched, as black, blurred or wholly masked ones do; take sharp photographs in light."
         )
     why = f"the best pair has {matched.counts().max(initial=0)} matches that fit together, but {MIN_MATCHES} are needed"
     if matched.unsure:

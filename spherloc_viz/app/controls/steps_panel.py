@@ -202,7 +202,9 @@ def _number(parts: str | list[str]) -> float:
 
 
 def stages_html(steps: Sequence[StepHeading], index: int) -> str:
-    """The stages as bars, each as long as it has steps and filled as far as the step at hand; a press goes there."""
+    """The stages as bars, each as long as it has steps and filled as far as the step at hand; a press goes there.
+
+    In a narrow panel the names of the others than that at hand are cut."""
     stages = list(dict.fromkeys(step.stage for step in steps))
     bars = []
     for stage in stages:
@@ -218,8 +220,9 @@ def stages_html(steps: Sequence[StepHeading], index: int) -> str:
         where = f"{index - own[0] + 1} of {len(own)}" if here else f"{len(own)} step{'s' if len(own) > 1 else ''}"
         bars.append(
             f'<div data-touch="step:{escape(steps[own[0]].key)}" role="button" tabindex="0" title="{escape(stage)}: '
-            f'{where}" style="flex:{len(own)} 1 auto;cursor:pointer;{css}">{bar}'
-            f'<div style="padding-top:.15em;white-space:nowrap">{escape(stage)}</div></div>'
+            f'{where}" style="flex:{len(own)} {0 if here else 1} auto;min-width:0;cursor:pointer;{css}">{bar}'
+            '<div style="padding-top:.15em;white-space:nowrap;overflow:hidden">'
+            f"{escape(stage)}</div></div>"
         )
     row = f'<div style="display:flex;gap:5px">{"".join(bars)}</div>'
     return box(row, "font-size:12px;padding-top:.4em;padding-bottom:.2em")

@@ -1,8 +1,9 @@
 """The table of all matches, page by page; it can be filtered, and a press on a heading sorts it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from html import escape
+from pathlib import Path
 
 import numpy as np
 import viser
@@ -30,7 +31,7 @@ from spherloc_viz.layers.matches import (
 
 MAX_REFERENCES = 8
 MAX_LETTERS = 18
-"""Longest name of a reference that its button shows in full."""
+"""Longest name of a reference that its button shows in full; where names are alike, they may be longer."""
 
 
 def chips_html(problem: Problem, inlier_mask: BoolArray, shown: int | None) -> str:
@@ -41,18 +42,32 @@ def chips_html(problem: Problem, inlier_mask: BoolArray, shown: int | None) -> s
     order = np.lexsort((-matches, -inliers))
     offered = [int(k) for k in order[:MAX_REFERENCES]]
     offered += [] if shown in offered else [shown]
+    names = _names_apart([problem.reference_images[k] for k in offered])
     chips = "".join(
         chip(
-            f"{shorten(problem.reference_images[k].name, MAX_LETTERS)}: {inliers[k]}/{matches[k]}",
+            f"{short}: {inliers[k]}/{matches[k]}",
             f"image-reference:{k}",
             k == shown,
-            f"{problem.reference_images[k].name}: {inliers[k]} inliers of {matches[k]} matches",
+            f"{name}: {inliers[k]} inliers of {matches[k]} matches",
         )
-        for k in offered
+        for k, (name, short) in zip(offered, names, strict=True)
     )
     left = f" {len(offered)} of {len(matches)} are offered." if len(offered) < len(matches) else ""
     note = f"References, inliers of matches.{left}"
     return box(f'<div style="opacity:.65;padding-bottom:.2em">{note}</div>{chips}', "font-size:12px")
+
+
+def _names_apart(paths: Sequence[Path]) -> list[tuple[str, str]]:
+    """Name of each file, with as many folders as tell it from the others, and as much of that name as does so."""
+    deepest = max(len(path.parts) for path in paths)
+    parts = next((n for n in range(1, deepest) if len({path.parts[-n:] for path in paths}) == len(paths)), deepest)
+    names = [Path(*path.parts[-parts:]).as_posix() for path in paths]
+    longest = max(map(len, names))
+    most = next(
+        (n for n in range(MAX_LETTERS, longest) if len({shorten(name, n) for name in names}) == len(names)),
+        max(longest, MAX_LETTERS),
+    )
+    return [(name, shorten(name, most)) for name in names]
 
 
 COLUMNS = (

@@ -14,6 +14,7 @@ from spherloc.datasets.given_path import MAX_FOLDERS, images_in_folders, images_
 from spherloc.datasets.scene_file import read_table
 from spherloc.errors import InputError
 from spherloc.files import IMAGES
+from spherloc.mapping.images.photographs import about_unread
 
 PAGE = 12
 """Rows that are shown at once."""
@@ -145,6 +146,7 @@ class Roots:
         """Folders, then TOML files, by name, each with its place; what was left out; how many are images; and how many
         lead out of the roots."""
         found: list[tuple[bool, str, Path, str]] = []
+        files: list[str] = []
         hidden = outside = photographs = 0
         whole = True
         with os.scandir(folder) as scan:
@@ -154,6 +156,8 @@ class Roots:
                     break
                 is_folder = _is_folder(entry)
                 photographs += not is_folder and Path(entry.name).suffix.lower() in IMAGES
+                if not is_folder:
+                    files.append(entry.name)
                 if not (is_folder or entry.name.lower().endswith(".toml")):
                     continue
                 if entry.name.startswith("."):
@@ -166,7 +170,7 @@ class Roots:
                 else:
                     found.append((not is_folder, entry.name, folder / entry.name, place))
         found.sort(key=lambda item: (item[0], item[1].casefold(), item[1]))
-        remarks = tuple(_remarks(hidden, outside, whole))
+        remarks = (*about_unread(sorted(files)), *_remarks(hidden, outside, whole))
         return [(path, place) for _, _, path, place in found], remarks, photographs, outside
 
 

@@ -45,6 +45,8 @@ class MapPanel:
         self._told = ""
         """What is said of the map that was made last, as HTML."""
         self._lock = threading.Lock()
+        self._number = 0
+        """Number of the maps that were begun."""
         self._process: subprocess.Popen[str] | None = None
         self._stopped = False
 
@@ -58,6 +60,7 @@ class MapPanel:
             if self._process is not None:
                 return
             self._stopped = False
+            self._number += 1
             command = [sys.executable, "-m", MODULE, str(folder), str(output), self._scale.value]
             # A process that is stopped leaves its temporary files there.
             scratch = TemporaryDirectory(prefix="spherloc-map-", ignore_cleanup_errors=True)
@@ -94,14 +97,15 @@ class MapPanel:
             self._process, stopped = None, self._stopped
         self._bar.visible = self._stop.visible = False
         if "scene" in said:
-            self._told = box(_table(said["summary"]), "font-size:12px;overflow-wrap:anywhere")
+            title = f"<div style='font-weight:600'>The map of {escape(folder.name)}</div>"
+            self._told = box(title + _table(said["summary"]), "font-size:12px;overflow-wrap:anywhere")
             self._text.content, self._report, self._save.visible = self._told, Path(said["report"]), True
             self._finished(Path(said["scene"]))
         elif stopped:
             self._say("Stopped; what was done is kept for the next time.")
         else:
             sentence = str(said.get("error", "the map could not be made; try the command spherloc map."))
-            self._text.content = status_html(begun(sentence), wrong=True) + self._told
+            self._text.content = self._in_sight(status_html(begun(sentence), wrong=True), "-wrong") + self._told
 
     def _save_report(self) -> None:
         """Send the report to the browser, which saves it."""
@@ -113,7 +117,11 @@ class MapPanel:
         self._client.send_file_download(f"{self._report.parent.name}.html", content, save_immediately=True)
 
     def _say(self, words: str) -> None:
-        self._text.content = status_html(words)
+        self._text.content = self._in_sight(status_html(words))
+
+    def _in_sight(self, html: str, kind: str = "") -> str:
+        """The same, to which the page scrolls when it comes: the list, in which a map is begun, may be far below."""
+        return f'<div data-reveal="map-{self._number}{kind}">{html}</div>'
 
 
 def _table(lines: Sequence[str]) -> str:

@@ -89,8 +89,10 @@ def _folder_html(listing: Listing, in_map: str, made: bool) -> str:
             rows.append(_row_html(f"open-folder:0:{row.place}", f"{row.name}/", row.about))
         else:
             rows.append(_scene_html(row))
+    if listing.photographs and listing.photographs < MIN_IMAGES:
+        rows.append(_row_html(None, f"{listing.photographs} photograph; a map takes {MIN_IMAGES} or more", ""))
     if not listing.rows and not listing.photographs:
-        rows.append(_row_html(None, "no folders and no scene files (*.toml)", ""))
+        rows.append(_row_html(None, "no folders, no photographs and no scene files (*.toml)", ""))
     pages = ""
     if listing.pages > 1:
         ways = (("‹ before", listing.page - 1), ("after ›", listing.page + 1))

@@ -1,9 +1,10 @@
 // Shows the introduction that Python put on the page (data-introduction) on the first visit: a card over the canvas with
 // a few moments, each of which takes the page to a step. Only the reader turns it: Continue, Back and Skip, the arrow keys, B, N
 // and Escape. It is not shown again: the browser remembers it. Nor is it shown to whoever comes by a link. An element of the
-// class "introduce" shows it again.
+// class "introduce" shows it again. Where panels that somebody has unfolded leave no room for it, it waits until they are
+// folded again.
 (() => {
-  const SEEN = "spherloc-introduction", EVERY_MS = 250;
+  const SEEN = "spherloc-introduction", EVERY_MS = 250, ROOM_PX = 200;
   const linked = location.hash.length > 1;
   let card = null, told = null, index = 0;
 
@@ -93,8 +94,10 @@
   function place() {
     const box = document.querySelector("canvas")?.getBoundingClientRect();
     if (!box) return;
+    card.hidden = box.width < ROOM_PX || document.body.classList.contains("unfolded");
+    document.documentElement.classList.toggle("introducing", !card.hidden);
+    if (card.hidden) return;
     document.documentElement.style.setProperty("--introduction", `${card.offsetHeight + 36}px`);
-    document.documentElement.classList.add("introducing");
     const width = Math.min(32.4 * parseFloat(getComputedStyle(card).fontSize), box.width - 24);
     Object.assign(card.style, { left: `${box.left + (box.width - width) / 2}px`, width: `${width}px` });
   }
@@ -108,7 +111,7 @@
   }, EVERY_MS);
 
   addEventListener("keydown", (event) => {
-    if (!card || !event.isTrusted || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (!card || card.hidden || !event.isTrusted || event.ctrlKey || event.metaKey || event.altKey) return;
     const by = { ArrowLeft: -1, b: -1, ArrowRight: 1, n: 1 }[event.key];
     const taken = event.target instanceof Element && event.target.closest("input, textarea, [role=slider], [role=tab]");
     if (event.key === "Escape") end();
@@ -119,7 +122,7 @@
   }, true);
   // The last card asks its reader to go on with the page: whoever does is done with it.
   addEventListener("pointerdown", (event) => {
-    const last = card && index === told.moments.length - 1;
+    const last = card && !card.hidden && index === told.moments.length - 1;
     if (!last || !event.isTrusted || !(event.target instanceof Element) || event.target.closest(".introduction, canvas")) return;
     remember();
     close();
