@@ -12,23 +12,33 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.principal_point import about_principal_point
 from spherloc.datasets.asl import asl_cameras, image_times
 from spherloc.datasets.asl_layout import DATA, SENSOR, AslSequence, asl_sequence, of_all_cameras
-from spherloc.datasets.given_path import SCENE, images_below, images_in_folders, what_it_is
+from spherloc.datasets.given_path import images_in_folders
 from spherloc.errors import InputError, SpherlocError, shorten
-from spherloc.files import IMAGES, is_folder, is_image, names_in
+from spherloc.files import is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
 from spherloc.images import DamagedImageError, check_image, is_turned
 from spherloc.mapping.advice import advice
 from spherloc.mapping.images.frames import MAX_IMAGES, FrameChoice, ImageFolder, chosen
 from spherloc.mapping.images.full_panorama import full_panoramas, near_two_to_one
+from spherloc.mapping.images.left_out import (
+    MAX_NAMED,
+    about_damaged,
+    about_deeper,
+    about_raw,
+    about_refused,
+    about_subfolders,
+    about_turned,
+    about_unread,
+    counted,
+    known_otherwise,
+    some_of,
+    without_photographs,
+)
 from spherloc.mapping.images.lens import for_colmap
 from spherloc.trajectory import NS_PER_S
 
 MIN_IMAGES = 2
-UNREAD = {".arw", ".avif", ".cr2", ".cr3", ".dng", ".gpr", ".heic", ".heif", ".insp", ".nef", ".orf", ".raf", ".rw2"}
-"""Endings of photographs that OpenCV does not read."""
-MAX_NAMED = 3
-"""Largest number of names in a remark."""
 CALIBRATIONS = (".yaml", ".yml", ".json", ".toml", ".txt", ".xml")
 CALLED_CALIBRATION = re.compile("calib|camera|camchain|intrinsic|sensor|lens|cam[0-9]*$")
 """Names of files that are taken for calibrations, so that one that cannot be read is told."""
@@ -83,7 +93,7 @@ def photographs(
     views, remarks = found.views, found.remarks
     if len(views) < MIN_IMAGES:
         raise InputError(
-            f"{folder}: has {_counted(len(views), 'photograph')} with a known camera; a map needs {MIN_IMAGES} or "
+            f"{folder}: has {counted(len(views), 'photograph')} with a known camera; a map needs {MIN_IMAGES} or "
             f"more, better ten. {' '.join(remarks)}".rstrip()
         )
     if len(views) > MAX_IMAGES:
@@ -122,7 +132,7 @@ def with_cameras(
     Raises ``InputError`` if the folder has no photographs, if their camera is unknown, or if it has no model in COLMAP.
     """
     if not is_folder(folder):
-        raise InputError(_known(folder) or f"{folder}: is not a folder; give the folder of the photographs.")
+        raise InputError(known_otherwise(folder) or f"{folder}: is not a folder; give the folder of the photographs.")
     there = names_in(folder)
     sequence = asl_sequence(folder)
     inside = {} if sequence else images_in_folders(folder, [name for name in there if not is_image(name)])
@@ -146,7 +156,7 @@ def with_cameras(
         known = known or dict(beside.cameras)
         views, about, lens = _of_folder(folder, places[0], cameras, beside, panorama, find_lens, of_map)
         calibrated |= {} if lens is None else {"": lens}
-        remarks += [*about, *_about_subfolders(inside)]
+        remarks += [*about, *about_subfolders(inside)]
         return Photographs(tuple(views), tuple(remarks), known, calibrated, others)
     folders = [place.camera for place in places]
     shared = {} if sequence else _of_files([folder / name for name in there], least=2).cameras
@@ -167,7 +177,7 @@ def with_cameras(
         if len(cameras_of(found)) == 1:
             known[place.camera] = found[0].camera
         remarks += [f"{shorten(place.camera)}: {remark}" for remark in about]
-    remarks += [] if sequence else _about_deeper(folder, [name for name in there if name not in inside])
+    remarks += [] if sequence else about_deeper(folder, [name for name in there if name not in inside])
     return Photographs(tuple(views), tuple(remarks), known, calibrated, others)
 
 
@@ -178,7 +188,7 @@ def _of_sequence(
     known = asl_cameras(sequence)
     places, calibrations, remarks = [], {}, list(known.remarks)
     if sequence.empty:
-        remarks.append(f"Without images in a folder {DATA}, and left out: {_some(sequence.empty)}.")
+        remarks.append(f"Without images in a folder {DATA}, and left out: {some_of(sequence.empty)}.")
     for name, images in sequence.cameras.items():
         times = image_times(images)
         inside = "" if images == root else images.relative_to(root).as_posix()
@@ -199,8 +209,8 @@ def _about_other_cameras(folder: Path) -> list[str]:
     if sequence is None or (whole := of_all_cameras(sequence)).cameras.keys() == sequence.cameras.keys():
         return []
     return [
-        f"These are the images of {_some(tuple(sequence.cameras))} of a recorded sequence; for a map of all of its "
-        f"cameras, {_some(tuple(whole.cameras))}, {advice('all cameras').format(folder=whole.folder)}."
+        f"These are the images of {some_of(tuple(sequence.cameras))} of a recorded sequence; for a map of all of its "
+        f"cameras, {some_of(tuple(whole.cameras))}, {advice('all cameras').format(folder=whole.folder)}."
     ]
 
 
@@ -266,9 +276,9 @@ def _of_folder(
             damaged.append(name)
         except InputError as error:
             refused.append(str(error))
-    remarks = [*_about_damaged(damaged), *_about_refused(refused), *about_unread(others)]
+    remarks = [*about_damaged(damaged), *about_refused(refused), *about_unread(others)]
     if not sizes:
-        raise InputError(_without_photographs(folder, remarks, of_map is not None))
+        raise InputError(without_photographs(folder, remarks, of_map is not None))
     cameras = given or {
         name: camera
         for name, camera in beside.cameras.items()
@@ -298,7 +308,7 @@ def _of_folder(
     unused = [] if given or used or panorama else beside.unused(sizes)
     remarks += unused
     unusable = bool(unused)
-    remarks += [*_about_raw(raw), *shapes]
+    remarks += [*about_raw(raw), *shapes]
     unused = [*unused, *shapes]
     no_lens = {*raw, *resized}
     sizes = {size: plain for size, names in sizes.items() if (plain := [name for name in names if name not in no_lens])}
@@ -346,7 +356,7 @@ def _of_folder(
             f"first is {shorten(rest[0])} with {width} x {height} pixels{and_so}"
         )
     full = [name for name, camera in camera_of.items() if isinstance(camera, Equirectangular)]
-    remarks += _about_turned(sorted(name for name in full if is_turned(folder / name)))
+    remarks += about_turned(sorted(name for name in full if is_turned(folder / name)))
     for_model: dict[str, Camera] = {}
     for camera in camera_of.values():
         if repr(camera) not in for_model:
@@ -391,7 +401,7 @@ def _with_cameras(
         return found, []
     first, *others = fitting
     taken = f"Camera {shorten(first)} is taken for all images of {size[0]} x {size[1]} pixels"
-    choice = f"but {_some(others)} would fit, too; {advice('which camera')}."
+    choice = f"but {some_of(others)} would fit, too; {advice('which camera')}."
     return dict.fromkeys(names, fitting[first]), [f"{taken}, {choice}"]
 
 
@@ -454,95 +464,3 @@ def _of_files(files: Sequence[Path], least: int = 1) -> FoundCalibrations:
             if CALLED_CALIBRATION.search(path.stem.lower()):
                 refused.append(f"A file beside them is not used: {error}")
     return FoundCalibrations(found, tuple(refused))
-
-
-def _about_damaged(names: Sequence[str]) -> list[str]:
-    if not names:
-        return []
-    return [f"{_were(len(names), 'image')} left out, damaged or empty: {_some(names)}; copy again what is needed."]
-
-
-def _about_refused(errors: Sequence[str]) -> list[str]:
-    """A remark on images that are too large, hold other numbers or may not be read, by the sentences on each."""
-    if not errors:
-        return []
-    first = "" if len(errors) == 1 else " The first:"
-    return [f"{_were(len(errors), 'image')} left out that cannot be read.{first} {errors[0]}"]
-
-
-def _about_raw(names: Sequence[str]) -> list[str]:
-    if not names:
-        return []
-    return [
-        f"{_were(len(names), 'image')} left out, two fisheye circles side by side and no panorama: {_some(names)}; "
-        f"{advice('two circles')}."
-    ]
-
-
-def _about_turned(names: Sequence[str]) -> list[str]:
-    """A remark on panoramas that programs show turned. That of other images is right: calibrations are of the pixels
-    as they are stored."""
-    if not names:
-        return []
-    have = f"{_counted(len(names), 'panorama')} {'has' if len(names) == 1 else 'have'}"
-    return [
-        f"{have} an orientation tag, which is not used: {_some(names)}; where pixels are upside down without it, save "
-        "them turned."
-    ]
-
-
-def about_unread(names: Sequence[str]) -> list[str]:
-    """A remark on photographs in formats that are not read, among files with these names; empty without any."""
-    unread = [name for name in names if Path(name).suffix.lower() in UNREAD and not name.startswith(".")]
-    if not unread:
-        return []
-    kinds = ", ".join(sorted({Path(name).suffix.lower() for name in unread}))
-    return [f"{_were(len(unread), 'photograph')} left out: {_some(unread)}; convert {kinds} to JPEG or PNG."]
-
-
-def _about_subfolders(inside: Mapping[str, int]) -> list[str]:
-    if not inside:
-        return []
-    left = f"{_were(sum(inside.values()), 'image')} left out, in subfolders: {_some(list(inside))}"
-    return [f"{left}; put each camera's images into a folder of its own to have them too."]
-
-
-def _about_deeper(root: Path, names: Sequence[str]) -> list[str]:
-    """A remark on images that are two folders deep or more."""
-    found = [deeper for name in names if is_folder(root / name) and (deeper := images_below(root / name))]
-    if not found:
-        return []
-    where, count = found[0]
-    return [f"{_were(count, 'image')} left out, deeper in the folder, in {where}; give that folder to have them."]
-
-
-def _known(path: Path) -> str:
-    """What a path is and what takes it, if it is known and no scene file is asked for instead; else empty."""
-    told = what_it_is(path)
-    return "" if SCENE in told else told
-
-
-def _without_photographs(folder: Path, remarks: Sequence[str], new: bool) -> str:
-    """Why a folder has nothing to map or, if its images are ``new``, to localize, and what to do."""
-    if remarks:
-        return f"{folder}: has no photographs that can be read. {' '.join(remarks)}"
-    if new:
-        deeper = images_below(folder)
-        if deeper:
-            return f"{folder}: has no images, but {deeper[1]} deeper in it, in {deeper[0]}; give that folder."
-        return f"{folder}: has no images; give a folder with images that are to be localized."
-    return (
-        _known(folder) or f"{folder}: has no photographs ({', '.join(sorted(IMAGES))}); give the folder that has them."
-    )
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
-
-
-def _were(count: int, what: str) -> str:
-    return f"{_counted(count, what)} {'was' if count == 1 else 'were'}"
-
-
-def _some(names: Sequence[str]) -> str:
-    return f"{', '.join(shorten(name) for name in names[:MAX_NAMED])}{', …' if len(names) > MAX_NAMED else ''}"

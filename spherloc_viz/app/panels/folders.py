@@ -14,7 +14,7 @@ from spherloc.datasets.given_path import MAX_FOLDERS, images_in_folders, images_
 from spherloc.datasets.scene_file import read_table
 from spherloc.errors import InputError
 from spherloc.files import IMAGES
-from spherloc.mapping.images.photographs import about_unread
+from spherloc.mapping.images.left_out import about_unread
 
 PAGE = 12
 """Rows that are shown at once."""
