@@ -17,7 +17,7 @@ from spherloc.errors import InputError
 from spherloc.estimators import estimate
 from spherloc.proof import write_proof
 from spherloc_viz.commands.cli import play
-from spherloc_viz.commands.flags import refuse_repeated
+from spherloc_viz.commands.flags import refuse_repeated, refuse_second_folder
 from spherloc_viz.commands.image_commands import localize
 from spherloc_viz.commands.scene_commands import run, sweep
 from tests.waiting import LIMIT_S
@@ -142,6 +142,13 @@ def test_a_user_without_a_home_has_a_cache(monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_flag_whose_first_value_would_be_lost_is_refused(words: str) -> None:
     with pytest.raises(InputError, match="is given 2 times; give it once"):
         refuse_repeated(words.split(), (run, localize, sweep, play))
+
+
+def test_a_map_of_two_folders_is_refused_with_the_flags_for_the_second() -> None:
+    with pytest.raises(InputError, match="'new' is a second one; give --localize new to localize its images"):
+        refuse_second_folder(["map", "photos", "new", "--panorama"])
+    for words in ("map", "map photos", "map photos --localize new", "map --output new photos", "run a.toml b.toml"):
+        refuse_second_folder(words.split())
 
 
 def test_flags_that_gather_and_words_that_are_no_flags_are_left_alone() -> None:

@@ -16,7 +16,15 @@ from spherloc_viz import given_files
 from spherloc_viz.commands import image_commands as of_images
 from spherloc_viz.commands import recording_commands as of_runs
 from spherloc_viz.commands import scene_commands as of_scenes
-from spherloc_viz.commands.flags import INTERRUPTED, RECORDINGS, Flag, OptionalFloat, OptionalPath, refuse_repeated
+from spherloc_viz.commands.flags import (
+    INTERRUPTED,
+    RECORDINGS,
+    Flag,
+    OptionalFloat,
+    OptionalPath,
+    refuse_repeated,
+    refuse_second_folder,
+)
 from spherloc_viz.importing import importing
 
 BROKEN_PIPE = 141
@@ -217,6 +225,7 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")
     try:
         refuse_repeated(sys.argv[1:], COMMANDS)
+        refuse_second_folder(sys.argv[1:])
         code: Any = app.cli(
             prog="spherloc",
             description="See why visual localization with fisheye and 360-degree cameras succeeds or fails.",

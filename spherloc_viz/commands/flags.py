@@ -1,4 +1,4 @@
-"""Types of flags, and a check for flags that are given twice although only the last value would count."""
+"""Types of flags, and checks of the words of a command line for what would be lost or is of another flag."""
 
 import typing
 from collections import Counter
@@ -68,6 +68,15 @@ def refuse_repeated(words: Sequence[str], commands: Sequence[Callable[..., Any]]
         if count > 1 and flag not in _gathering(command):
             hint = HINTS.get((command.__name__, flag), "")
             raise InputError(f"{show(flag)} is given {count} times; give it once{', ' if hint else ''}{hint}.")
+
+
+def refuse_second_folder(words: Sequence[str]) -> None:
+    """Raise ``InputError`` if ``words``, those of the command line, begin with ``map`` and two folders."""
+    if words[:1] == ["map"] and len(words) > 2 and not any(word.startswith("-") for word in words[1:3]):
+        raise InputError(
+            f"map makes a map of one folder, and {show(words[2])} is a second one; give --localize {words[2]} to "
+            f"localize its images in the map, or --output {words[2]} to have the map there."
+        )
 
 
 def _flag(word: str) -> str:
