@@ -38,9 +38,9 @@ def test_scale_is_found_among_wrong_positions(rng, size):
 
 
 def test_its_standard_deviation_is_that_of_repetitions(rng):
-    """Of 300 draws of noise, without a wrong position."""
+    """Of 100 draws of noise, without a wrong position."""
     points = rng.normal(size=(12, 3)) * 5.0
-    fits = [overlaid(points, 3.0 * points + 0.2 * rng.normal(size=points.shape)) for _ in range(300)]
+    fits = [overlaid(points, 3.0 * points + 0.2 * rng.normal(size=points.shape)) for _ in range(100)]
     scales = np.array([fit.scale for fit in fits])
     assert np.median([fit.scale_sd for fit in fits]) == pytest.approx(scales.std() / 3.0, rel=0.3)
     assert scales.mean() == pytest.approx(3.0, rel=0.01)
