@@ -13,6 +13,7 @@ from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.alignment.line_gravity import GravityByLines
 from spherloc.mapping.alignment.positions import gps_of_images
+from spherloc.mapping.alignment.rig_poses import turned_otherwise
 from spherloc.mapping.alignment.rig_scale import doubt_of_scale, scale_by_rig
 from spherloc.mapping.alignment.upright import (
     Level,
@@ -234,12 +235,16 @@ def _finished(
 ) -> tuple[Reconstruction, Level, MapScale]:
     """A model with images added later and without those whose own gravity, or what another camera took together with
     them, disagrees, and those far off; its gravity and its scale."""
-    shots = shots_of(views)
+    shots, fixed = shots_of(views), measured.fixed
+    if fixed is not None:
+        made = made.without(turned_otherwise(made.poses, fixed))
     made = made.without(level_of(made.poses, gravity).leaning)
     made = made.without(misfits(made.poses, shots) | far_off(made.poses))
-    made = place_rest(made, views, elsewhere, gravity, level_of(made.poses, gravity), tell)
+    made = place_rest(made, views, elsewhere, gravity, level_of(made.poses, gravity), tell, fixed)
     level = level_of(made.poses, gravity)
     made = made.without(level.leaning.keys() | misfits(made.poses, shots) | far_off(made.poses))
+    if fixed is not None:
+        made = made.without(turned_otherwise(made.poses, fixed))
     return made, level, scale_of(made, level, measured)
 
 

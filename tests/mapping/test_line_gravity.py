@@ -12,9 +12,9 @@ from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.errors import InputError
 from spherloc.frontend.view import Gravity, View
-from spherloc.geometry import camera_centre, so3_exp
+from spherloc.geometry import DOWN, camera_centre, pose, so3_exp
 from spherloc.mapping.alignment.gravity_check import check_stated
-from spherloc.mapping.alignment.line_gravity import gravity_by_lines, share_below
+from spherloc.mapping.alignment.line_gravity import RIGHT, GravityByLines, gravity_by_lines, share_below
 from spherloc.mapping.alignment.stated_gravity import StatedGravity
 
 COUNT = 7
@@ -150,3 +150,17 @@ def test_stated_gravity_that_contradicts_the_down_of_panoramas(tmp_path, rng):
     assert said.endswith("check how the IMU is turned to the camera.")
     (said,) = check_stated(stated_of(views, so3_exp(np.radians([90.0, 0.0, 0.0]))), views, quiet)
     assert "differs from the panoramas' own down by 90° (median) and seems wrong" in said
+
+
+def test_edges_of_paving_stones_lay_no_image_on_its_side():
+    """More images show them than vertical edges, but they run both ways."""
+    names = [f"{number}.png" for number in range(24)]
+    poses = {name: pose(np.eye(3), np.array([float(number), 0.0, 0.0])) for number, name in enumerate(names)}
+    vertical = {name: Gravity(DOWN, "lines of the image") for name in names[:8]}
+    ahead = np.array([0.0, 0.0, 1.0])
+    paving = {name: Gravity(RIGHT if k < 14 else ahead, "lines of the image") for k, name in enumerate(names)}
+    other = GravityByLines(paving, {}, sideways=True)
+    known = GravityByLines(vertical, {}, unsure=True, other=other).in_map(poses, np.zeros((1, 3)))
+    assert not known.sideways and known.found == vertical and not known.unsure
+    on_side = replace(other, found=dict.fromkeys(names, Gravity(RIGHT, "lines of the image")))
+    assert GravityByLines(vertical, {}, unsure=True, other=on_side).in_map(poses, np.zeros((1, 3))).sideways

@@ -1,6 +1,7 @@
-"""The scale of a map by cameras that are fixed to each other, as their calibration says."""
+"""Scale and poses of a map by cameras that are fixed to each other, as their calibration says."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre, pose
 from spherloc.mapping.alignment.positions import Positions
+from spherloc.mapping.alignment.rig_poses import expected_by_calibration, turned_otherwise
 from spherloc.mapping.alignment.rig_scale import FixedImages, doubt_of_scale, fixed_images, scale_by_rig
 from spherloc.mapping.alignment.upright import Level, MapScale
 from spherloc.mapping.images.given_cameras import given_cameras
@@ -55,6 +57,31 @@ def test_the_scale_is_that_of_the_baselines(rng):
     scale = Rig(rng).scale
     assert scale.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=1e-9)
     assert "rig.json: images that cameras" in scale.source and "at 12 times; the scale is good to" in scale.source
+
+
+def test_images_that_are_turned_otherwise_are_told(rng):
+    rig = Rig(rng, noise_m=0.01, turned_deg=0.5)
+    assert turned_otherwise(rig.poses, rig.fixed) == set()
+    around = Rotation.from_rotvec([0.0, 0.0, np.pi]).as_matrix()
+    for name in ("a3", "b7"):
+        rig.poses[name] = pose(around @ rig.poses[name][:, :3], rig.poses[name][:, 3])
+    assert turned_otherwise(rig.poses, rig.fixed) == {"a3", "b7"}
+    others = {name: rig.bodies["bca"["abc".index(name[0])]] for name in rig.poses}
+    assert turned_otherwise(rig.poses, replace(rig.fixed, body_from_camera=others)) == set(), "of another rig"
+
+
+def test_where_an_image_must_be_is_told_by_one_of_its_time(rng):
+    """Its centre only if the scale is known."""
+    rig = Rig(rng)
+    left = {name: rig.poses.pop(name) for name in ("a2", "c2", "b5")}
+    found = expected_by_calibration(rig.poses, rig.fixed)
+    assert found.keys() == left.keys()
+    for name, known in left.items():
+        np.testing.assert_allclose(found[name], known, atol=1e-9)
+    few = {name: rig.poses[name] for name in ("b2", "a5", "c5")}
+    found = expected_by_calibration(few, rig.fixed)["a2"]
+    np.testing.assert_allclose(found[:, :3], left["a2"][:, :3], atol=1e-9)
+    np.testing.assert_allclose(camera_centre(found), camera_centre(few["b2"]), atol=1e-9)
 
 
 def test_its_uncertainty_is_that_of_the_errors(rng):

@@ -32,6 +32,8 @@ AGREE_DEG = 3.0
 """Gravity of two images agrees in the map if it differs by less from the middle of all."""
 CLEARLY_MORE = 1.25
 """Images are stored sideways if this many times more of them agree so than upright."""
+FEW = 2
+"""So many more are counted for a share, as a few images agree by chance."""
 LEANING_DEG = 20.0
 """If images lean more than that in the median and would agree as well sideways, they may be stored sideways."""
 
@@ -65,18 +67,20 @@ class GravityByLines:
         if self.other is None:
             return replace(self, unsure=False)
         upright, sideways = sorted((replace(self, unsure=False, other=None), self.other), key=lambda one: one.sideways)
-        here, there = upright._agreeing(poses), sideways._agreeing(poses)
-        if there >= MIN_IMAGES and there > CLEARLY_MORE * here:
+        (here, upright_share), (there, sideways_share) = upright._agreeing(poses), sideways._agreeing(poses)
+        if there >= MIN_IMAGES and there > CLEARLY_MORE * here and sideways_share > upright_share:
             return sideways._turned_down(poses, points)
         return replace(upright, unsure=there > here / CLEARLY_MORE and upright.leans)
 
-    def _agreeing(self, poses: Mapping[str, FloatArray]) -> int:
-        """Number of images whose gravity is about the middle of all, in the map."""
+    def _agreeing(self, poses: Mapping[str, FloatArray]) -> tuple[int, float]:
+        """Number of images whose gravity is about the middle of all, in the map, and their share: a low one, however
+        many they are, is that of horizontal edges, such as those of paving stones."""
         downs = self._downs(poses)
         if not downs:
-            return 0
+            return 0, 0.0
         near = np.stack(downs) @ middle(np.stack(downs)) > np.cos(np.radians(AGREE_DEG))
-        return int(np.count_nonzero(near))
+        agreeing = int(np.count_nonzero(near))
+        return agreeing, agreeing / (len(downs) + FEW)
 
     def _downs(self, poses: Mapping[str, FloatArray]) -> list[FloatArray]:
         return [poses[name][:, :3].T @ one.down for name, one in self.found.items() if name in poses]

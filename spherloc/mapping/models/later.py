@@ -18,6 +18,8 @@ from spherloc.errors import ProblemError
 from spherloc.estimators import default_options, estimate
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN, transform
+from spherloc.mapping.alignment.rig_poses import expected_by_calibration
+from spherloc.mapping.alignment.rig_scale import FixedImages
 from spherloc.mapping.alignment.upright import Level, arbitrary_scale
 from spherloc.mapping.models.model import Reconstruction, SeenPoints, contradictions, points_of
 from spherloc.mapping.parallel import Tell
@@ -57,11 +59,13 @@ def place_rest(
     gravity: Mapping[str, Gravity],
     level: Level,
     tell: Tell,
+    fixed: FixedImages | None = None,
 ) -> Reconstruction:
     """The map with those left-out images whose pose is accepted; those named in ``elsewhere`` are not tried.
 
     ``gravity`` is that from vertical lines, by the name of the image. Where a camera took an image together with one
-    that is in the map, only matches that fit its expected pose are taken. An image that contradicts others once its
+    that is in the map, only matches that fit its expected pose are taken: by the map or, with ``fixed``, by how the
+    cameras are fixed to each other. An image that contradicts others once its
     points are in the map is left out again.
     """
     names, shots = [view.name for view in views], shots_of(views)
@@ -71,6 +75,8 @@ def place_rest(
         placed: dict[str, _Placed] = {}
         unit = arbitrary_scale(made.depths()).metres_per_unit
         expected = expected_poses(made.poses, shots)
+        if fixed is not None:
+            expected |= expected_by_calibration(made.poses, fixed)
         for done, view in enumerate(left, start=1):
             one = _place(made, view, gravity.get(view.name), level, unit, expected.get(view.name))
             if one is not None and _undoubted(made, names, view.name, one):
