@@ -43,9 +43,9 @@ def cut(panorama: Path, cam_from_panorama: np.ndarray, path: Path) -> View:
     return View(path.name, CAMERA, path, np.column_stack([cam_from_panorama, np.zeros(3)]))
 
 
-def poses_of(views: Sequence[View]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Poses of views by name, and a point below them."""
-    return {view.name: np.asarray(view.cam_from_map) for view in views}, np.array([[0.0, 1.0, 0.0]])
+def maps_of(views: Sequence[View]) -> tuple[list[dict[str, np.ndarray]], np.ndarray]:
+    """A map of views: their poses by name, and a point below them."""
+    return [{view.name: np.asarray(view.cam_from_map) for view in views}], np.array([[0.0, 1.0, 0.0]])
 
 
 def views(folder: Path, data: Path, head: tuple[float, float, float], sideways: bool, seed: int) -> list[View]:
@@ -74,7 +74,7 @@ def main() -> None:
                 sets = (views(Path(place), given.data, head, sideways, seed) for seed in range(given.sets))
                 told = [(gravity_by_lines(one, lambda *_: None), one) for one in sets]
                 clear = [lines.sideways == sideways for lines, _ in told if not lines.unsure]
-                in_map = [lines.in_map(*poses_of(one)).sideways == sideways for lines, one in told]
+                in_map = [lines.in_maps(*maps_of(one)).sideways == sideways for lines, one in told]
                 way = "sideways" if sideways else "upright"
                 tilts = f"{head[0]:g}°, {head[1]:g}° | {head[2]:g}°"
                 counts = f"{sum(clear)} | {len(clear) - sum(clear)} | {sum(in_map)} of {given.sets}"

@@ -156,7 +156,7 @@ def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
     first, *others = built.models
     kept = Kept(built.masks, request.how, stated)
     known = {} if stated is None else stated.found
-    lines = built.lines.in_map(first.poses, first.points())
+    lines = built.lines.in_maps([one.poses for one in built.models], first.points())
     gravity = {**known, **lines.found}
     found = _finished(first, views, nearer_to_others(first, others), gravity, measured, tell)
     inside = set(found[0].poses)

@@ -60,12 +60,12 @@ def quiet(*_) -> None:
     """Nobody is told."""
 
 
-def map_of(views: list[View]) -> tuple[dict, np.ndarray]:
-    """Poses, and points of which two thirds are below the cameras."""
+def maps_of(views: list[View]) -> tuple[list[dict], np.ndarray]:
+    """A map: poses, and points of which two thirds are below the cameras."""
     poses = {view.name: view.cam_from_map for view in views}
     centres = np.stack([camera_centre(pose) for pose in poses.values()])
     offsets = np.tile([[2.0, 0.0, -1.0], [0.0, 3.0, -0.5], [1.0, 1.0, 0.8]], (len(views), 1))
-    return poses, np.repeat(centres, 3, axis=0) + offsets
+    return [poses], np.repeat(centres, 3, axis=0) + offsets
 
 
 @pytest.mark.parametrize("quarters", [1, 3])
@@ -74,10 +74,10 @@ def test_images_that_are_stored_sideways_tell_down_all_the_same(upright, tmp_pat
     views = turned(upright, tmp_path, quarters)
     lines = gravity_by_lines(views, quiet)
     assert lines.sideways and not lines.unsure and len(lines.found) >= 5
-    poses, points = map_of(views)
-    assert share_below(poses, points, np.array([0.0, 0.0, -1.0])) == pytest.approx(2 / 3)
+    maps, points = maps_of(views)
+    assert share_below(maps[0], points, np.array([0.0, 0.0, -1.0])) == pytest.approx(2 / 3)
     for doubted in (lines, replace(lines, unsure=True), replace(lines.other, other=replace(lines, other=None))):
-        found = doubted.in_map(poses, points)
+        found = doubted.in_maps(maps, points)
         assert found.sideways and not found.unsure
         assert max(off_deg(view, found.found[view.name]) for view in views if view.name in found.found) < 1.0
 
@@ -85,9 +85,9 @@ def test_images_that_are_stored_sideways_tell_down_all_the_same(upright, tmp_pat
 def test_upright_images_are_not_taken_for_such(upright):
     lines = gravity_by_lines(upright, quiet)
     assert not lines.sideways and not lines.unsure
-    poses, points = map_of(upright)
+    maps, points = maps_of(upright)
     for doubted in (lines, replace(lines, unsure=True), replace(lines.other, other=replace(lines, other=None))):
-        found = doubted.in_map(poses, points)
+        found = doubted.in_maps(maps, points)
         assert not found.sideways and not found.unsure
         assert max(off_deg(view, found.found[view.name]) for view in upright) < 1.0
 
@@ -100,11 +100,11 @@ def test_a_camera_that_has_not_turned_does_not_tell(upright, tmp_path):
     ]
     lines = gravity_by_lines(views, quiet)
     assert lines.unsure and not lines.sideways
-    assert lines.in_map(*map_of(views)).sideways
+    assert lines.in_maps(*maps_of(views)).sideways
     same = [replace(view, cam_from_map=views[0].cam_from_map) for view in views]  # they all see the same
     both = replace(lines, found={view.name: lines.other.found[views[0].name] for view in views})
     other = replace(lines.other, found={view.name: lines.other.found[views[0].name] for view in views})
-    found = replace(both, other=other).in_map(*map_of(same))
+    found = replace(both, other=other).in_maps(*maps_of(same))
     assert found.unsure and not found.sideways
 
 
@@ -160,7 +160,7 @@ def test_edges_of_paving_stones_lay_no_image_on_its_side():
     ahead = np.array([0.0, 0.0, 1.0])
     paving = {name: Gravity(RIGHT if k < 14 else ahead, "lines of the image") for k, name in enumerate(names)}
     other = GravityByLines(paving, {}, sideways=True)
-    known = GravityByLines(vertical, {}, unsure=True, other=other).in_map(poses, np.zeros((1, 3)))
+    known = GravityByLines(vertical, {}, unsure=True, other=other).in_maps([poses], np.zeros((1, 3)))
     assert not known.sideways and known.found == vertical and not known.unsure
     on_side = replace(other, found=dict.fromkeys(names, Gravity(RIGHT, "lines of the image")))
-    assert GravityByLines(vertical, {}, unsure=True, other=on_side).in_map(poses, np.zeros((1, 3))).sideways
+    assert GravityByLines(vertical, {}, unsure=True, other=on_side).in_maps([poses], np.zeros((1, 3))).sideways

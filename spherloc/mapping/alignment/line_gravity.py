@@ -58,29 +58,31 @@ class GravityByLines:
         angles = [np.degrees(np.arccos(np.clip(one.down @ DOWN, -1.0, 1.0))) for one in self.found.values()]
         return bool(angles) and float(np.median(angles)) > LEANING_DEG
 
-    def in_map(self, poses: Mapping[str, FloatArray], points: FloatArray) -> "GravityByLines":
-        """This or the other way round, whichever agrees better in a map of images with ``poses`` (3, 4).
+    def in_maps(self, maps: Sequence[Mapping[str, FloatArray]], points: FloatArray) -> "GravityByLines":
+        """This or the other way round, whichever agrees better in maps of images: poses (3, 4) by name, of each.
 
-        Where images are stored sideways, down is their right or left, whichever has more points (N, 3) below the camera
-        next to them: rooms and streets have more to see below. Images that lean are ``unsure`` if both ways agree.
+        Where images are stored sideways, down is their right or left, whichever has more ``points`` (N, 3) of the first
+        map below the camera next to them: rooms and streets have more to see below. Images that lean are ``unsure`` if
+        both ways agree.
         """
         if self.other is None:
             return replace(self, unsure=False)
         upright, sideways = sorted((replace(self, unsure=False, other=None), self.other), key=lambda one: one.sideways)
-        (here, upright_share), (there, sideways_share) = upright._agreeing(poses), sideways._agreeing(poses)
+        (here, upright_share), (there, sideways_share) = upright._agreeing(maps), sideways._agreeing(maps)
         if there >= MIN_IMAGES and there > CLEARLY_MORE * here and sideways_share > upright_share:
-            return sideways._turned_down(poses, points)
+            return sideways._turned_down(maps[0], points)
         return replace(upright, unsure=there > here / CLEARLY_MORE and upright.leans)
 
-    def _agreeing(self, poses: Mapping[str, FloatArray]) -> tuple[int, float]:
-        """Number of images whose gravity is about the middle of all, in the map, and their share: a low one, however
+    def _agreeing(self, maps: Sequence[Mapping[str, FloatArray]]) -> tuple[int, float]:
+        """Number of images whose gravity is about the middle of all in their map, and their share: a low one, however
         many they are, is that of horizontal edges, such as those of paving stones."""
-        downs = self._downs(poses)
-        if not downs:
-            return 0, 0.0
-        near = np.stack(downs) @ middle(np.stack(downs)) > np.cos(np.radians(AGREE_DEG))
-        agreeing = int(np.count_nonzero(near))
-        return agreeing, agreeing / (len(downs) + FEW)
+        agreeing = count = 0
+        for poses in maps:
+            downs = self._downs(poses)
+            if downs:
+                near = np.stack(downs) @ middle(np.stack(downs)) > np.cos(np.radians(AGREE_DEG))
+                agreeing, count = agreeing + int(np.count_nonzero(near)), count + len(downs)
+        return agreeing, agreeing / (count + FEW)
 
     def _downs(self, poses: Mapping[str, FloatArray]) -> list[FloatArray]:
         return [poses[name][:, :3].T @ one.down for name, one in self.found.items() if name in poses]
@@ -163,16 +165,17 @@ def _of(views: Collection[View], found: Mapping[str, Gravity | str]) -> dict[str
 
 
 def _steady_share(views: Collection[View], found: Mapping[str, Gravity | str]) -> float:
-    """Share of the views whose gravity was found and is about that of the others of their camera."""
+    """Share of the views whose gravity is about that of the others of their camera, of those where it was found."""
     by_camera: dict[str, list[View]] = defaultdict(list)
     for view in views:
         by_camera[repr(view.camera)].append(view)
-    steady = 0
+    steady = count = 0
     for own in by_camera.values():
         downs = [one.down for one in _of(own, found).values()]
         if downs:
             steady += np.count_nonzero(np.stack(downs) @ middle(np.stack(downs)) > np.cos(np.radians(STEADY_DEG)))
-    return steady / max(1, len(views))
+        count += len(downs)
+    return steady / (count + FEW)
 
 
 def middle(directions: FloatArray) -> FloatArray:
