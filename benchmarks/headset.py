@@ -31,7 +31,10 @@ from spherloc.types import FloatArray
 from spherloc.worlds import Conditions, build_world, render
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "aria_gen2"
-ROWS = ("apartment:8:-13", "apartment:3:13", "apartment:11:35", "street:2:13", "campus:4:13")
+ROWS = (
+    *("apartment:8:-13", "apartment:3:13", "apartment:11:35", "street:2:13", "street:7:-20"),
+    *("campus:4:13", "campus:9:-13", "campus:13:13"),
+)
 TIMES, NEW = 9, (3, 4, 5)
 STEP_NS, EXPOSED_APART_NS, START_NS = 100_000_000, 700_001, 7_385_024_932_864
 MOVE_M = (0.033, 0.003, 0.044)

@@ -27,7 +27,8 @@ MIN_IMAGES = 5
 STEADY_DEG = 16.0
 """Gravity of an image is steady if it is this near to the middle of those of its camera: heads tilt."""
 CLEAR = 0.25
-"""If the shares of images that are steady upright and sideways differ by less, only the map tells which they are."""
+"""If the shares of images that are steady upright and sideways differ by less, or those of the images that show edges
+say the opposite, only the map tells which they are."""
 AGREE_DEG = 3.0
 """Gravity of two images agrees in the map if it differs by less from the middle of all."""
 CLEARLY_MORE = 1.25
@@ -131,13 +132,14 @@ def gravity_by_lines(views: Sequence[View], tell: Tell, stated: Mapping[str, Gra
     free = [v for v in todo if repr(v.camera) not in near and not isinstance(v.camera, Equirectangular)]
     if not free or len(free) < len(todo):
         return _told(upright, sideways=False)
-    more = _steady_share(free, sideways) - _steady_share(free, upright)
+    more, better = _steady_shares(free, sideways) - _steady_shares(free, upright)
     one, other = _told(upright, sideways=False), _told(sideways, sideways=True)
     if len(free) < MIN_IMAGES:
         return replace(one, unsure=one.leans, other=other)
-    if more <= -CLEAR:
+    if more <= -CLEAR and better < 0.0:
         return replace(one, other=other)
-    return replace(other, other=one) if more >= CLEAR else replace(one, unsure=True, other=other)
+    told = more >= CLEAR and better > 0.0
+    return replace(other, other=one) if told else replace(one, unsure=True, other=other)
 
 
 def _told(found: Mapping[str, Gravity | str], *, sideways: bool) -> GravityByLines:
@@ -164,8 +166,9 @@ def _of(views: Collection[View], found: Mapping[str, Gravity | str]) -> dict[str
     return {view.name: one for view in views if isinstance(one := found[view.name], Gravity)}
 
 
-def _steady_share(views: Collection[View], found: Mapping[str, Gravity | str]) -> float:
-    """Share of the views whose gravity is about that of the others of their camera, of those where it was found."""
+def _steady_shares(views: Collection[View], found: Mapping[str, Gravity | str]) -> FloatArray:
+    """Shares (2,) of images whose gravity is about that of the others of their camera: of the views, and of those in
+    which gravity was found."""
     by_camera: dict[str, list[View]] = defaultdict(list)
     for view in views:
         by_camera[repr(view.camera)].append(view)
@@ -175,7 +178,7 @@ def _steady_share(views: Collection[View], found: Mapping[str, Gravity | str]) -
         if downs:
             steady += np.count_nonzero(np.stack(downs) @ middle(np.stack(downs)) > np.cos(np.radians(STEADY_DEG)))
         count += len(downs)
-    return steady / (count + FEW)
+    return np.array([steady / max(1, len(views)), steady / (count + FEW)])
 
 
 def middle(directions: FloatArray) -> FloatArray:
