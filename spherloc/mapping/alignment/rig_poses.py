@@ -48,13 +48,15 @@ def expected_by_calibration(poses: Mapping[str, FloatArray], fixed: FixedImages)
         units = 0.0
     found: dict[str, FloatArray] = {}
     for names in fixed.times.values():
-        first = next((name for name in names if name in poses), None)
-        for name in names if first is not None else ():
-            if name in poses:
-                continue
-            body, there = fixed.body_from_camera[first], fixed.body_from_camera[name]
-            body_from_map = _body_from_map(fixed, first, poses[first])
-            centre = camera_centre(poses[first]) + units * body_from_map.T @ (there[:3, 3] - body[:3, 3])
-            rotation = there[:3, :3].T @ body_from_map
-            found[name] = pose(rotation, -rotation @ centre)
+        inside = [name for name in names if name in poses]
+        if not inside:
+            continue
+        first = inside[0]
+        body_from_map, body = _body_from_map(fixed, first, poses[first]), fixed.body_from_camera[first]
+        for name in names:
+            if name not in poses:
+                there = fixed.body_from_camera[name]
+                centre = camera_centre(poses[first]) + units * body_from_map.T @ (there[:3, 3] - body[:3, 3])
+                rotation = there[:3, :3].T @ body_from_map
+                found[name] = pose(rotation, -rotation @ centre)
     return found
