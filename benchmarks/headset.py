@@ -124,7 +124,7 @@ def cells(folder: Path, poses: Mapping[str, FloatArray]) -> str:
         view.name: view.cam_from_map for view in (*scene.references, *scene.queries) if view.cam_from_map is not None
     }
     scale, rotation, shift = aligned(mapped, poses)
-    said = next(line for line in done.stdout.splitlines() if line.startswith("scale")).rpartition("good to ")[2]
+    scale_line = next(line for line in done.stdout.splitlines() if line.startswith("scale"))
     found = localized(next((folder / "recordings").glob("*/")))
 
     def off(these: Mapping[str, FloatArray]) -> str:
@@ -138,7 +138,9 @@ def cells(folder: Path, poses: Mapping[str, FloatArray]) -> str:
     images = len(scene.references) + len(scene.queries), len(found)
     asked = [len(list((folder / kind).iterdir())) for kind in ("map", "new")]
     in_map, new = (f"{have} of {count}" for have, count in zip(images, asked, strict=True))
-    known = f"{100 * (1.0 / scale - 1.0):+.1f} ({said})"
+    known = "units unknown"
+    if scene.metric:
+        known = f"{100 * (1.0 / scale - 1.0):+.1f} ({scale_line.rpartition('good to ')[2]})"
     return f"{in_map} | {off(mapped)} | {known} | {new} | {off(found)} | {seconds:.0f}"
 
 
