@@ -66,8 +66,15 @@ def test_images_that_are_turned_otherwise_are_told(rng):
     for name in ("a3", "b7"):
         rig.poses[name] = pose(around @ rig.poses[name][:, :3], rig.poses[name][:, 3])
     assert turned_otherwise(rig.poses, rig.fixed) == {"a3", "b7"}
+
+
+def test_the_calibration_of_another_rig_is_not_believed(rng):
+    rig = Rig(rng)
     others = {name: rig.bodies["bca"["abc".index(name[0])]] for name in rig.poses}
-    assert turned_otherwise(rig.poses, replace(rig.fixed, body_from_camera=others)) == set(), "of another rig"
+    fixed = replace(rig.fixed, body_from_camera=others)
+    assert turned_otherwise(rig.poses, fixed) == set()
+    del rig.poses["a2"]
+    assert expected_by_calibration(rig.poses, fixed) == {} and "a2" in expected_by_calibration(rig.poses, rig.fixed)
 
 
 def test_where_an_image_must_be_is_told_by_one_of_its_time(rng):

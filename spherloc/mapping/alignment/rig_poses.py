@@ -17,14 +17,20 @@ def turned_otherwise(poses: Mapping[str, FloatArray], fixed: FixedImages) -> set
 
     None of them if the map agrees with less than half of what the calibration says, which then is another rig's.
     """
-    balances = [_balances(poses, fixed, names) for names in fixed.times.values()]
-    if sum(sum(one.values()) for one in balances) <= 0:
-        return set()
-    return {name for one in balances for name, balance in one.items() if balance < 0}
+    return {name for name, balance in _balances(poses, fixed).items() if balance < 0}
 
 
-def _balances(poses: Mapping[str, FloatArray], fixed: FixedImages, names: Sequence[str]) -> dict[str, int]:
-    """How many more images of one time speak for each of them than against it."""
+def _balances(poses: Mapping[str, FloatArray], fixed: FixedImages) -> dict[str, int]:
+    """How many more images of its time speak for an image of the map than against it, by name; empty if the map agrees
+    with no more than half of what the calibration says."""
+    found: dict[str, int] = {}
+    for names in fixed.times.values():
+        found |= _balances_of_time(poses, fixed, names)
+    return found if sum(found.values()) > 0 else {}
+
+
+def _balances_of_time(poses: Mapping[str, FloatArray], fixed: FixedImages, names: Sequence[str]) -> dict[str, int]:
+    """``_balances`` of the images of one time."""
     bodies = {name: _body_from_map(fixed, name, poses[name]) for name in names if name in poses}
     balances = dict.fromkeys(bodies, 0)
     for one, other in combinations(bodies, 2):
@@ -41,7 +47,10 @@ def _body_from_map(fixed: FixedImages, name: str, cam_from_map: FloatArray) -> F
 
 def expected_by_calibration(poses: Mapping[str, FloatArray], fixed: FixedImages) -> dict[str, FloatArray]:
     """Poses (3, 4) that images which are not in a map of ``poses`` (3, 4) should have, by one of those that were taken
-    together with each. Where nothing tells the scale of the map, cameras are taken to be in one place."""
+    together with each; none if the map does not agree with the calibration. Where nothing tells the scale of the map,
+    cameras are taken to be in one place."""
+    if not _balances(poses, fixed):
+        return {}
     try:
         units = 1.0 / scale_by_rig(poses, fixed).metres_per_unit
     except InputError:

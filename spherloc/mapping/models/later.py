@@ -65,8 +65,7 @@ def place_rest(
 
     ``gravity`` is that from vertical lines, by the name of the image. Where a camera took an image together with one
     that is in the map, only matches that fit its expected pose are taken: by the map or, with ``fixed``, by how the
-    cameras are fixed to each other. An image that contradicts others once its
-    points are in the map is left out again.
+    cameras are fixed to each other. An image that contradicts others once its points are in the map is left out again.
     """
     names, shots = [view.name for view in views], shots_of(views)
     refused = set(elsewhere)
