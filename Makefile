@@ -43,7 +43,7 @@ lint: ## Check style, format and types
 	@status=0; \
 	$(BIN)/python -m ruff check . || status=1; \
 	$(BIN)/python -m ruff format --check . || status=1; \
-	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/python -m pyright || status=1; \
+	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/python -m pyright --threads 2 || status=1; \
 	exit $$status
 
 bench: ## Measure spherloc beside its peers, about an hour; a stopped run goes on

@@ -148,7 +148,8 @@ install_python() {
   "$venv" -m pip --version >/dev/null 2>&1 || "$venv" -m ensurepip >/dev/null 2>&1 ||
     die ".venv has no pip; run 'make clean' and try again."
   say "installing Python packages into .venv (the first time takes a minute or more)"
-  watch "$venv" -m pip install --disable-pip-version-check -e ".$extras" ||
+  # Most modules are never imported; the others are compiled when they are.
+  watch "$venv" -m pip install --disable-pip-version-check --no-compile -e ".$extras" ||
     die "pip could not install the packages, for the reason above; mend that and try again."
   if [[ $target != @(lint|docs) ]]; then
     "$venv" -c 'import sys; from spherloc.warm_up import warm_up
