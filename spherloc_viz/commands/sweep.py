@@ -24,6 +24,7 @@ from spherloc_viz.commands.run import Records, parse_settings, store_of
 from spherloc_viz.layers.primitives import Table
 from spherloc_viz.layers.sweep import sweep_table
 from spherloc_viz.options import usable_estimators
+from spherloc_viz.plots.saving import png_of
 
 if TYPE_CHECKING:
     from spherloc_viz.recording.storage.store import RecordingStore
@@ -253,6 +254,4 @@ def maps_png(over: str, by: str, found: Points) -> bytes:
         axes.set_visible(False)
     if image is not None:
         figure.colorbar(image, ax=figure.axes[: len(names)], label="success (%)")
-    file = io.BytesIO()
-    figure.savefig(file, format="png", metadata={"Software": None})
-    return file.getvalue()
+    return png_of(figure)

@@ -1,6 +1,5 @@
 """The paper's figures, drawn from our own runs: Figs. 5 to 7 as SVG, Figs. 8 to 10 from sessions of a dataset."""
 
-import io
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from spherloc.types import BoolArray, FloatArray
 from spherloc.verification.experiments import METHODS, PHASE_GRAVITY_DEG, PHASE_METHODS, phase_key
 from spherloc.verification.measured import Cell, Measured
 from spherloc.verification.sessions import DATASETS, TABLE_METHODS
+from spherloc_viz.plots.saving import png_of, svg_of
 from spherloc_viz.style import ERROR_RAMP, css
 
 DPI = 110
@@ -162,7 +162,7 @@ def inliers_png(
         axes.set_title(f"{item.label}: {words}", parse_math=False, fontsize=9)
     for axes in panels:
         axes.set_axis_off()
-    return _png(figure)
+    return png_of(figure)
 
 
 def trajectories_by_error_png(several: Sequence[tuple[str, SequenceResults]], limit_m: float) -> bytes:
@@ -187,7 +187,7 @@ def trajectories_by_error_png(several: Sequence[tuple[str, SequenceResults]], li
         axes.set_visible(False)
     if drawn is not None:
         figure.colorbar(drawn, ax=panels[: len(several)], label="position error (m)", shrink=0.8)
-    return _png(figure)
+    return png_of(figure)
 
 
 def _panel(
@@ -225,12 +225,6 @@ def _panel(
     return drawn
 
 
-def _png(figure: Figure) -> bytes:
-    file = io.BytesIO()
-    figure.savefig(file, format="png", metadata={"Software": None})
-    return file.getvalue()
-
-
 FIGURES = ("fig5", "fig6", "fig7", "fig6-normal", "fig7-normal")
 """Experiments that are drawn."""
 BOXES: Mapping[str, str] = {"MC": "#7b2d8b", "2P100": "#1b6ca8", "SVD100": "#c77d0a", "ML100": "#3a8a3a"}
@@ -264,9 +258,7 @@ def figure_svg(experiment: str, camera: str, over: str, measured: Measured) -> s
             _noise(figure, experiment, camera, measured)
         else:
             _rates(figure, experiment, camera, over, measured)
-        file = io.StringIO()
-        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
-    return file.getvalue()
+        return svg_of(figure)
 
 
 def phase_svg(measured: Measured) -> str:
@@ -279,9 +271,7 @@ def phase_svg(measured: Measured) -> str:
             _phases(axes, measured, gravity_deg, counts)
         handles = [Patch(facecolor=color, edgecolor="0.4", label=name) for name, color in PHASE_COLORS.items()]
         figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8.5, frameon=False)
-        file = io.StringIO()
-        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
-    return file.getvalue()
+        return svg_of(figure)
 
 
 def _phases(axes: Axes, measured: Measured, gravity_deg: float, counts: Sequence[int]) -> None:

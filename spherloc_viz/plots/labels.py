@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from spherloc.errors import shorten
 from spherloc.types import FloatArray
+from spherloc_viz.plots.saving import fix_layout
 
 FONT_SIZE = 8
 MAX_LETTERS = 40
@@ -51,7 +52,7 @@ def write_labels(
     """
     figure = axes.figure
     assert isinstance(figure, Figure) and isinstance(figure.canvas, FigureCanvasAgg)
-    figure.draw_without_rendering()  # fixes where the axes are
+    fix_layout(figure)
     renderer, edge = figure.canvas.get_renderer(), np.asarray(axes.get_window_extent().extents)
     centres = axes.transData.transform(np.reshape(dots, (-1, 2)))
     covered = np.concatenate([centres - DOT_PX, centres + DOT_PX], axis=1)

@@ -1,6 +1,5 @@
 """Picture of a map from above: its points and images, with the names for which there is room."""
 
-import io
 from collections.abc import Mapping
 
 import numpy as np
@@ -10,6 +9,7 @@ from matplotlib.figure import Figure
 from spherloc.types import FloatArray
 from spherloc_viz.plots.frames import around, corners, frames_of, with_room
 from spherloc_viz.plots.labels import PlaceName, write_labels
+from spherloc_viz.plots.saving import png_of
 
 TOGETHER, MAX_LINES = 0.02, 4
 """Images that are closer than this share of the extent of all have their names under each other, at most so many."""
@@ -51,9 +51,7 @@ def map_above(points: FloatArray, centres: Mapping[str, FloatArray], joined: boo
     labels = names_at(places, list(centres))
     without = set(write_labels(panels[-1], labels, places, beside=True))
     named = sum(min(len(label.lines), MAX_LINES) for label in labels if label not in without)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", metadata={"Software": None})
-    return file.getvalue(), len(centres) - named
+    return png_of(figure), len(centres) - named
 
 
 def names_at(places: FloatArray, names: list[str]) -> list[PlaceName]:

@@ -1,6 +1,5 @@
 """Charts of sweeps as PNG."""
 
-import io
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,6 +11,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from spherloc.experiments.sweep_plan import AXES
 from spherloc.experiments.sweep_rows import Point
 from spherloc_viz.layers.sweep import SweepChart, sweep_charts
+from spherloc_viz.plots.saving import png_of
 from spherloc_viz.style import RGB, css
 
 SIZE_INCHES, SWEEP_DPI = (10.7, 7.6), 120
@@ -37,9 +37,7 @@ def sweep_png(name: str, over: str, labels: Sequence[str], points: Sequence[Poin
     runs = sorted({point.runs for point in points})
     count = "no runs" if not runs else f"{runs[0]}" + (f" to {runs[-1]}" if runs[1:] else "") + " runs a point"
     figure.suptitle(f"{name}: {AXES[over]}, {count}", parse_math=False, fontsize=12)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", metadata={"Software": None})
-    return file.getvalue()
+    return png_of(figure)
 
 
 def _legend(figure: Figure) -> tuple[list, list[str]]:

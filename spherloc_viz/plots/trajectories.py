@@ -1,6 +1,5 @@
 """Pictures of localized sequences from above: the map, the positions with their directions of view, and failures."""
 
-import io
 import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
@@ -23,6 +22,7 @@ from spherloc.geometry import align_to_down, camera_centre
 from spherloc.types import BoolArray, FloatArray
 from spherloc_viz.plots.frames import Frame, around, corners, frames_of, with_room
 from spherloc_viz.plots.labels import MAX_LETTERS, PlaceName, write_labels
+from spherloc_viz.plots.saving import png_of
 from spherloc_viz.plots.sweeps import CURVE_MARKERS
 from spherloc_viz.style import ERROR_RAMP, ESTIMATE, OUTLIER, REFERENCE, TRUTH, css, error_scale
 
@@ -111,7 +111,7 @@ def trajectory_png(results: SequenceResults, backdrop: Backdrop) -> bytes:
     free = np.concatenate([places[np.isfinite(places).all(axis=1)], arrows])
     named = _named(axes, results, places, true_places)
     write_labels(axes, [*named, *_named_images(axes, backdrop.names, images)], free)
-    return _png(figure)
+    return png_of(figure)
 
 
 def _with_near(places: FloatArray, images: FloatArray) -> Frame:
@@ -186,12 +186,6 @@ def _legend(figure: Figure, axes: Axes) -> None:
         legend = figure.legend(handles, names, loc="outside lower center", ncols=columns, fontsize=9, frameon=False)
         for text in legend.get_texts():
             text.set_parse_math(False)  # names of queries may have dollar signs
-
-
-def _png(figure: Figure) -> bytes:
-    file = io.BytesIO()
-    figure.savefig(file, format="png", metadata={"Software": None})
-    return file.getvalue()
 
 
 def _map(axes: Axes, results: SequenceResults, backdrop: Backdrop) -> None:
@@ -282,7 +276,7 @@ def trajectories_png(several: Sequence[tuple[str, SequenceResults]], backdrop: B
     _title(figure, first.configuration.name)
     _legend(figure, axes)
     write_labels(axes, labels, everywhere[np.isfinite(everywhere).all(axis=1)])
-    return _png(figure)
+    return png_of(figure)
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ def figure_of(monkeypatch):
     """Gives the figure of a picture instead of its bytes, drawn once."""
 
     def draw(picture, *about):
-        monkeypatch.setattr(trajectories, "_png", lambda figure: figure)
+        monkeypatch.setattr(trajectories, "png_of", lambda figure: figure)
         figure = picture(*about)
         figure.canvas.draw()
         return figure
