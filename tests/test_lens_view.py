@@ -8,7 +8,7 @@ from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.experiments.results import QueryResult
 from spherloc.frontend.view import View
 from spherloc.geometry import pose
-from spherloc_viz.app.controls.query_strip import ordered, strip_html, thumbnail
+from spherloc_viz.app.controls.query_strip import end_of, ordered, strip_html, thumbnail
 from spherloc_viz.layers.lens_view import through_lens
 
 LENS = KannalaBrandt(320, 320, 110.0, 110.0, 160.0, 160.0, (0.0, 0.0, 0.0, 0.0))
@@ -63,6 +63,13 @@ def test_without_points_there_is_no_picture(tmp_path):
     assert through_lens(LENS, AT_ORIGIN, [View("a.png", view.camera, view.path, AT_ORIGIN)]) is None
     (tmp_path / "a.png").unlink()
     assert through_lens(LENS, AT_ORIGIN, [view]) is None
+
+
+def test_names_below_thumbnails_tell_images_apart():
+    """Their ends, without what all have, in two lines."""
+    assert end_of("hall_1.png", 2.0) == "hall_1"
+    assert end_of("slam-side-right_7385324932864.png", 1.0) == "…7385324932864"
+    assert end_of("slam-side-right_7385324932864.png", 2.0) == "…am-side-right_7385324932864"
 
 
 def test_the_strip_is_sorted_turned_and_told(tmp_path):

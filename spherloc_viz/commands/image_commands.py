@@ -316,7 +316,7 @@ def map(
 
     from spherloc.cameras.calibration import camera_names
     from spherloc.datasets.query_gravity import camera_from_imu as rotation_of
-    from spherloc.frontend.masks import Masks
+    from spherloc.frontend.masks import MAX_NADIR_DEG, MAX_SEAM_DEG, Masks
     from spherloc.mapping.request import ScaleMeasurement
     from spherloc_viz.commands.map import MAX_METRES, distance_of, make
 
@@ -328,6 +328,9 @@ def map(
     for flag, metres in (("--camera-height", camera_height), ("--distance", apart and apart[2])):
         if metres is not None and not 0.0 < metres < MAX_METRES:
             raise InputError(f"{flag} is {metres:g}; give a positive number of metres.")
+    for flag, degrees, most in (("--nadir", nadir, MAX_NADIR_DEG), ("--seam", seam, MAX_SEAM_DEG)):
+        if degrees is not None and not 0.0 <= degrees <= most:
+            raise InputError(f"{flag} is {degrees:g}; give degrees from 0 to {most:g}.")
     if frames is not None and not 2 <= frames <= 500:
         raise InputError(f"--frames is {frames}; give a number from 2 to 500.")
     if camera_from_imu is not None and gravity is None:

@@ -16,6 +16,7 @@ from spherloc.files import lock
 from spherloc.mapping.images.photographs import photographs
 from spherloc.mapping.make import make_map
 from spherloc.mapping.request import MapRequest, ScaleMeasurement
+from spherloc_viz.commands.image_commands import map as map_command
 from spherloc_viz.commands.map import (
     _stages,
     distance_of,
@@ -151,3 +152,17 @@ def test_a_distance_is_two_images_and_metres():
     for words in (("a.jpg", "b.jpg"), ("a.jpg", "b.jpg", "far"), ("a.jpg", "b.jpg", "3", "folder")):
         with pytest.raises(InputError, match=r"--distance is '.*'; give two images and the metres between them"):
             distance_of(words)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ({"nadir": 95.0}, "--nadir is 95; give degrees from 0 to 80"),
+        ({"seam": -1.0}, "--seam is -1; give degrees from 0 to 30"),
+        ({"camera_height": 0.0}, "--camera-height is 0; give a positive number of metres"),
+        ({"frames": 1}, "--frames is 1; give a number from 2 to 500"),
+    ],
+)
+def test_wrong_numbers_are_named_as_they_were_given(tmp_path, words, said):
+    with pytest.raises(InputError, match=said):
+        map_command(tmp_path, **words)

@@ -8,7 +8,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import cv2
 
@@ -28,6 +28,8 @@ HEIGHT_PX, MAX_WIDTH_PX = 52, 104
 """Size of a thumbnail."""
 KEPT = 400
 """Thumbnails that are remembered."""
+LETTER_PX, LINES = 7, 2
+"""Width of a letter of a name below a thumbnail, and how many lines the name may have."""
 WAITING = "waiting"
 MARKS = {
     LOCALIZED: ("✓", style.INLIER),
@@ -194,15 +196,24 @@ def _cell(view: View, picture: str, row: QueryResult | None, unit: str) -> str:
         if picture
         else f'<div style="width:{HEIGHT_PX}px;height:{HEIGHT_PX}px;background:rgba(128,140,160,.2)"></div>'
     )
-    # As wide as the picture; of a longer name the end is shown, which tells queries apart.
-    cut = "width:0;min-width:100%;overflow:hidden;text-overflow:ellipsis;white-space:nowrap;direction:rtl"
-    name = f'<div aria-hidden="true" style="{cut};text-align:center;{DIM}"><bdi>{escape(view.name)}</bdi></div>'
+    # As wide as the picture, to which it must not give a width of its own.
+    wrapped = "width:0;min-width:100%;overflow-wrap:anywhere;line-height:1.15"
+    words = escape(end_of(view.name, view.camera.width / view.camera.height))
+    name = f'<div aria-hidden="true" style="{wrapped};text-align:center;{DIM}">{words}</div>'
     return (
         f'<div role="listitem"><div role="button" tabindex="0" data-touch="strip-open:{escape(view.name)}" '
         f'title="{escape(said)}" aria-label="{escape(said)}" '
         f'style="position:relative;border:{border};border-radius:4px;cursor:pointer;overflow:hidden">{image}{mark}'
         f"</div>{name}</div>"
     )
+
+
+def end_of(name: str, shape: float) -> str:
+    """As much of a query's name without its suffix as fits below a thumbnail, the end, which tells queries apart;
+    ``shape`` is the image's width by its height."""
+    stem = name.removesuffix(PurePosixPath(name).suffix)
+    room = LINES * int(min(MAX_WIDTH_PX, shape * HEIGHT_PX) / LETTER_PX)
+    return stem if len(stem) <= room else f"…{stem[1 - room :]}"
 
 
 def said_of(name: str, row: QueryResult | None, unit: str) -> str:
