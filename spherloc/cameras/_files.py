@@ -50,6 +50,10 @@ for _type in OPENCV_TYPES:  # read as plain tables
     _Loader.add_constructor(f"tag:yaml.org,2002:{_type}", yaml.SafeLoader.construct_yaml_map)
 
 
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", yaml.SafeLoader.construct_yaml_seq)
+"""Sizes, as Python scripts write them without thinking of other readers."""
+
+
 def read_text(path: Path) -> str:
     """The text of a calibration file; raises ``CalibrationError`` if it is missing, not text, or too large."""
     if is_image(path.name) and is_file(path):
@@ -94,6 +98,8 @@ def parse_yaml(text: str) -> Any:
         what = shorten(
             str(getattr(error, "problem", None) or getattr(error, "reason", None) or "syntax error"), MAX_REASON
         )
+        if "python/object/apply:numpy" in str(error):
+            raise UnrecognisedError(f"{place} has an array of NumPy: write it as a list, by its tolist().") from None
         raise UnrecognisedError(f"{place} is not valid YAML ({what}): correct it.") from None
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         # PyYAML raises these for impossible dates, numbers and tags, and for deep nesting.

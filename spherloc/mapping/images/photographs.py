@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from spherloc.cameras.base import Camera
-from spherloc.cameras.calibration import camera_names, load_camera
+from spherloc.cameras.calibration import about_calibration, camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.principal_point import about_principal_point
 from spherloc.datasets.asl import asl_cameras, image_times
@@ -304,6 +304,7 @@ def _of_folder(
     used = [name for name, camera in cameras.items() if any(camera is one for one in camera_of.values())]
     if used and not given:
         remarks.append(f"The calibration found beside them: {', '.join(map(shorten, used))}.")
+        remarks += [f"{shorten(name)}: {beside.concluded[name]}" for name in used if name in beside.concluded]
     remarks += [about for name in used if (about := about_principal_point(name, cameras[name]))]
     unused = [] if given or used or panorama else beside.unused(sizes)
     remarks += unused
@@ -423,6 +424,8 @@ class FoundCalibrations:
     """By the name of the file or, if it has several, of the camera in it."""
     refused: tuple[str, ...] = ()
     """Why files are not read that are called as calibrations are, a sentence each."""
+    concluded: Mapping[str, str] = field(default_factory=dict)
+    """What files do not say of their lens and was concluded, a sentence each, by the name of the file."""
 
     def unused(self, sizes: Collection[tuple[int, int]]) -> list[str]:
         """Why none of it is used for images of these sizes, a sentence each."""
@@ -452,7 +455,7 @@ def calibrations_in(root: Path, inside: str = "") -> FoundCalibrations:
 def _of_files(files: Sequence[Path], least: int = 1) -> FoundCalibrations:
     """What those of the files hold that are calibrations of at least so many cameras."""
     found: dict[str, Camera] = {}
-    refused = []
+    refused, concluded = [], dict[str, str]()
     for path in [path for path in files if path.suffix.lower() in CALIBRATIONS][:MAX_CALIBRATIONS]:
         try:
             names = camera_names(path)
@@ -460,7 +463,9 @@ def _of_files(files: Sequence[Path], least: int = 1) -> FoundCalibrations:
                 found |= {name: load_camera(path, name) for name in names}
             elif least <= 1:
                 found[path.stem] = load_camera(path)
+                if about := about_calibration(path):
+                    concluded[path.stem] = about
         except SpherlocError as error:  # not a calibration, but for its name
             if CALLED_CALIBRATION.search(path.stem.lower()):
                 refused.append(f"A file beside them is not used: {error}")
-    return FoundCalibrations(found, tuple(refused))
+    return FoundCalibrations(found, tuple(refused), concluded)
