@@ -25,9 +25,9 @@ PIXEL_CENTRE_SHIFT = 0.5
 """Added to a principal point that counts from the centre of the top-left pixel."""
 
 KNOWN = (
-    "give a YAML of KITTI-360, Kalibr, EuRoC, stella, ROS or 360Loc, a file of OpenCV, a JSON of Basalt, Project Aria "
-    "or nerfstudio, COLMAP's cameras.txt, kapture's sensors.txt, an OCamCalib text or a TOML with a [camera] table "
-    "(docs/conventions.md has its keys)"
+    "give a YAML of KITTI-360, Kalibr, EuRoC, stella, ROS or 360Loc, a file of OpenCV, a JSON of Basalt, Project Aria, "
+    "WoodScape or nerfstudio, COLMAP's cameras.txt, kapture's sensors.txt, an OCamCalib text or a TOML with a [camera] "
+    "table (docs/conventions.md has its keys)"
 )
 
 

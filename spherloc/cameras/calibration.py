@@ -27,6 +27,7 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_text import colmap_lines, colmap_text
 from spherloc.cameras.extensions import camera_class_of, read_by_extensions, tried
 from spherloc.cameras.opencv_files import about_opencv, is_opencv, opencv, opencv_arrays
+from spherloc.cameras.woodscape_files import is_woodscape, woodscape
 from spherloc.errors import CalibrationError, InputError, reason, show
 from spherloc.registry import extension_of, guarded
 
@@ -48,12 +49,12 @@ def load_camera(path: str | Path, name: str | None = None, size: tuple[int, int]
     pinhole or omni with radtan, equidistant or none, ds, eucm), the YAML of stella_vslam (``Camera``), 360Loc
     (``imgw``) and fisheye-calib-adapter (``parameter``), that of ROS and the YAML, XML or JSON of OpenCV's samples
     and of scripts (``distortion_coefficients``, ``D`` and other names), a Basalt JSON (``value0``), a JSON of cameras
-    by name (``model``, ``params``), nerfstudio's ``transforms.json`` (``fl_x``), COLMAP's ``cameras.txt``, OCamCalib's
-    ``calib_results.txt`` and a TOML with a ``[camera]`` table or with its keys at the top. ``name`` picks one of
-    ``camera_names``, by default the first one. ``size`` is that of the images, px, for a file of OpenCV that does not
-    state it. Principal points that count from the centre of the top-left pixel are moved by +0.5 pixels to this
-    project's convention (that centre is (0.5, 0.5)). A file of another kind is given to the readers of extensions
-    (docs/extending.md).
+    by name (``model``, ``params``), nerfstudio's ``transforms.json`` (``fl_x``), a JSON of WoodScape
+    (``intrinsic``), COLMAP's ``cameras.txt``, OCamCalib's ``calib_results.txt`` and a TOML with a ``[camera]`` table or
+    with its keys at the top. ``name`` picks one of ``camera_names``, by default the first one. ``size`` is that of the
+    images, px, for a file of OpenCV that does not state it. Principal points that count from the centre of the top-left
+    pixel are moved by +0.5 pixels to this project's convention (that centre is (0.5, 0.5)). A file of another kind is
+    given to the readers of extensions (docs/extending.md).
 
     Raises ``CalibrationError``, naming the file and the place, for whatever cannot be read as a usable camera.
     """
@@ -148,6 +149,8 @@ def _from_json(document: Any, name: str | None, size: tuple[int, int] | None) ->
         return tool_files.basalt(document, name)
     if json_files.named_cameras(document):
         return json_files.camera_named(document, name)
+    if is_woodscape(document):
+        return woodscape(document, name)
     if json_files.is_transforms(document):
         _refuse_name(name)
         return json_files.transforms(document)
