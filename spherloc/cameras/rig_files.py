@@ -68,7 +68,7 @@ def _of_chain(text: str) -> RigCalibration:
         return RigCalibration()
     chain = kalibr_chain(document)
     from_imu = _along(chain, None)
-    of_first = _along(chain, np.eye(4)) if not from_imu else {}
+    of_first = _along(chain, np.eye(4)) if not from_imu and len(chain) > 1 else {}
     found = {name: np.asarray(np.linalg.inv(there), np.float64) for name, there in (from_imu or of_first).items()}
     return RigCalibration(found, bool(from_imu), {name: one.timeshift_s for name, one in chain.items()})
 
