@@ -100,8 +100,8 @@ def _camera(document: dict[Any, Any], of_images: tuple[int, int] | None) -> tupl
         camera: Camera = KannalaBrandt(*focal, _four(lens, coefficients, "k1, k2, k3, k4"))
     else:
         camera = Mei(*focal, 0.0, _four(lens, coefficients, "k1, k2, p1, p2"))
-    kind = "a fisheye (cv2.fisheye)" if fisheye else "a pinhole (cv2.calibrateCamera)"
-    told = f"its four coefficients are taken for those of {kind}, since {why}; distortion_model would say it."
+    kind, other = ("a fisheye (cv2.fisheye)", "plumb_bob") if fisheye else ("a pinhole", "equidistant")
+    told = f"its four coefficients are taken for those of {kind}, since {why}; if not, add distortion_model: {other}."
     return camera, told if why else ""
 
 

@@ -341,7 +341,7 @@ def test_four_coefficients_that_show_what_they_are(tmp_path, kind, real):
     path = scripted(tmp_path, named_by_all(*real))
     camera = load_camera(path)
     assert type(camera) is kind and camera.distortion == real[2]
-    told = "a fisheye (cv2.fisheye)" if kind is KannalaBrandt else "a pinhole (cv2.calibrateCamera)"
+    told = "a fisheye (cv2.fisheye)" if kind is KannalaBrandt else "a pinhole"
     assert about_calibration(path).startswith(f"its four coefficients are taken for those of {told}, since ")
 
 

@@ -9,10 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from spherloc.cameras.base import in_image
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.radial_poly import RadialPoly
 from spherloc.cameras.rig_files import read_rig
 from spherloc.errors import CalibrationError
+from spherloc.mapping.images.lens import for_colmap
 
 LENS = {
     **{"model": "radial_poly", "poly_order": 4, "k1": 339.749, "k2": -31.988, "k3": 48.275, "k4": -7.201},
@@ -119,6 +121,20 @@ def test_wrong_places_are_told(tmp_path, place, said):
 def test_another_name_is_told(tmp_path):
     with pytest.raises(CalibrationError, match="describes the camera 'FV' only: ask for it instead of 'RV'"):
         load_camera(written(tmp_path, FRONT), "RV")
+
+
+def test_lenses_for_colmap(tmp_path):
+    """Kannala-Brandt has no even powers; a lens that needs more terms is written as FISHEYE624."""
+    for changed, model in (({}, "kannala_brandt"), ({"k2": -60.0, "k3": 90.0, "k4": -20.0}, "fisheye624")):
+        lens = load_camera(written(tmp_path, FRONT | {"intrinsic": LENS | changed}))
+        fitted, remark = for_colmap(lens)
+        assert fitted.model == model and "The lens (radial_poly) is written as" in remark
+        points = random_directions(5, 3000)
+        points = points[points[:, 2] > np.cos(np.radians(85.0)) * np.linalg.norm(points, axis=1)]
+        there = lens.project(points)[0]
+        inside = in_image(lens, there)
+        off = np.linalg.norm(fitted.project(points)[0] - there, axis=1)[inside]
+        assert inside.sum() > 500 and off.max() < 0.45 and np.sqrt((off**2).mean()) < 0.1
 
 
 def test_the_scipy_order_of_quaternions(tmp_path):
