@@ -26,6 +26,7 @@ EXPORTS = {
     "KannalaBrandt": "cameras.kannala_brandt",
     "Mei": "cameras.mei",
     "Ocam": "cameras.ocam",
+    "RadialPoly": "cameras.radial_poly",
     "Problem": "problem",
     "Trace": "trace",
     "CalibrationError": "errors",

@@ -6,6 +6,7 @@ from spherloc.cameras.fisheye624 import Fisheye624 as Fisheye624
 from spherloc.cameras.kannala_brandt import KannalaBrandt as KannalaBrandt
 from spherloc.cameras.mei import Mei as Mei
 from spherloc.cameras.ocam import Ocam as Ocam
+from spherloc.cameras.radial_poly import RadialPoly as RadialPoly
 from spherloc.datasets import bundled_scenes as bundled_scenes
 from spherloc.datasets import load_scene as load_scene
 from spherloc.diagnosis import diagnose as diagnose

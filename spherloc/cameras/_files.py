@@ -25,9 +25,9 @@ PIXEL_CENTRE_SHIFT = 0.5
 """Added to a principal point that counts from the centre of the top-left pixel."""
 
 KNOWN = (
-    "give a YAML of KITTI-360, Kalibr, EuRoC, stella, ROS or 360Loc, a file of OpenCV, a JSON of Basalt, Project Aria "
-    "or nerfstudio, COLMAP's cameras.txt, kapture's sensors.txt, an OCamCalib text or a TOML with a [camera] table "
-    "(docs/conventions.md has its keys)"
+    "give a YAML of KITTI-360, Kalibr, EuRoC, stella, ROS or 360Loc, a file of OpenCV, a JSON of Basalt, Project Aria, "
+    "WoodScape or nerfstudio, COLMAP's cameras.txt, kapture's sensors.txt, an OCamCalib text or a TOML with a [camera] "
+    "table (docs/conventions.md has its keys)"
 )
 
 
@@ -48,6 +48,10 @@ arrays of one dimension."""
 
 for _type in OPENCV_TYPES:  # read as plain tables
     _Loader.add_constructor(f"tag:yaml.org,2002:{_type}", yaml.SafeLoader.construct_yaml_map)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", yaml.SafeLoader.construct_yaml_seq)
+"""Sizes, as Python scripts write them without thinking of other readers."""
 
 
 def read_text(path: Path) -> str:
@@ -94,6 +98,8 @@ def parse_yaml(text: str) -> Any:
         what = shorten(
             str(getattr(error, "problem", None) or getattr(error, "reason", None) or "syntax error"), MAX_REASON
         )
+        if "python/object/apply:numpy" in str(error):
+            raise UnrecognisedError(f"{place} has an array of NumPy: write it as a list, by its tolist().") from None
         raise UnrecognisedError(f"{place} is not valid YAML ({what}): correct it.") from None
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         # PyYAML raises these for impossible dates, numbers and tags, and for deep nesting.

@@ -59,16 +59,18 @@ _ON_AXIS = 1e-100
 class AngleCurve:
     """Maps directions to points of a plane in focal lengths from the principal point, and back."""
 
-    def __init__(self, coefficients: tuple[float, ...], largest_radius: float = inf) -> None:
-        """``coefficients`` are k1, k2, ...; the curve ends at ``largest_radius`` if it reaches it."""
+    def __init__(self, coefficients: tuple[float, ...], largest_radius: float = inf, step: int = 2) -> None:
+        """theta_d = theta (1 + k1 theta^step + k2 theta^(2 step) + ...) with the ``coefficients`` k1, k2, ...; the
+        curve ends at ``largest_radius`` if it reaches it."""
         self._coefficients = coefficients
+        self._step = step
         self._largest_radius = largest_radius
 
     @cached_property
     def max_angle_rad(self) -> float:
         """Largest angle to the optical axis that can be inverted: the first maximum of theta_d, at most pi."""
-        slope = [(2 * n + 1) * k for n, k in enumerate(self._coefficients, start=1)]
-        peak = float(min(np.sqrt(first_positive_root(slope)), np.pi) * (1.0 - RIM_MARGIN))
+        slope = [(self._step * n + 1) * k for n, k in enumerate(self._coefficients, start=1)]
+        peak = float(min(first_positive_root(slope) ** (1.0 / self._step), np.pi) * (1.0 - RIM_MARGIN))
         if self.radius(np.array(peak)) <= self._largest_radius:
             return peak
         return float(self._bisect(np.array([self._largest_radius]), peak)[0])
@@ -80,7 +82,7 @@ class AngleCurve:
 
     def radius(self, theta: FloatArray) -> FloatArray:
         """theta_d of angles (N,) in radians."""
-        s = theta * theta
+        s = theta**self._step
         factor = np.zeros_like(s)
         for k in reversed(self._coefficients):
             factor = s * (k + factor)
@@ -127,10 +129,10 @@ class AngleCurve:
 
     def _slope(self, theta: FloatArray) -> FloatArray:
         """d theta_d / d theta."""
-        s = theta * theta
+        s = theta**self._step
         factor = np.zeros_like(s)
         for n in range(len(self._coefficients), 0, -1):
-            factor = s * ((2 * n + 1) * self._coefficients[n - 1] + factor)
+            factor = s * ((self._step * n + 1) * self._coefficients[n - 1] + factor)
         return 1.0 + factor
 
     def _angle(self, theta_d: FloatArray) -> FloatArray:

@@ -17,6 +17,7 @@ MODEL_NAMES = {
     "kannala_brandt": "Kannala-Brandt",
     "mei": "MEI",
     "ocam": "OCamCalib",
+    "radial_poly": "radial polynomial",
 }
 """Names of models for users; other models are called as in files, with spaces for underscores."""
 

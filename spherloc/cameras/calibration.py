@@ -7,6 +7,7 @@ added to the principal point. The project's own TOML is taken as it is, and so a
 
 import re
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,8 @@ from spherloc.cameras._files import (
 from spherloc.cameras.base import Camera
 from spherloc.cameras.colmap_text import colmap_lines, colmap_text
 from spherloc.cameras.extensions import camera_class_of, read_by_extensions, tried
-from spherloc.cameras.tool_files import opencv
+from spherloc.cameras.opencv_files import about_opencv, is_opencv, opencv, opencv_arrays
+from spherloc.cameras.woodscape_files import is_woodscape, woodscape
 from spherloc.errors import CalibrationError, InputError, reason, show
 from spherloc.registry import extension_of, guarded
 
@@ -34,9 +36,6 @@ _ONE_CAMERA = {
     "parameter": tool_files.adapter,
     "Camera": tool_files.stella,
     "intrinsics": tool_files.euroc,
-    "distortion_coefficients": opencv,
-    "Distortion_Coefficients": opencv,
-    "D": opencv,
 }
 """Readers of files of one camera without a name, by the top-level key by which the kind is recognised."""
 
@@ -49,12 +48,13 @@ def load_camera(path: str | Path, name: str | None = None, size: tuple[int, int]
     The kind is recognised by the content: a KITTI-360 YAML (``model_type: MEI``), a Kalibr camchain (``cam0``, ...:
     pinhole or omni with radtan, equidistant or none, ds, eucm), the YAML of stella_vslam (``Camera``), 360Loc
     (``imgw``) and fisheye-calib-adapter (``parameter``), that of ROS and the YAML, XML or JSON of OpenCV's samples
-    (``distortion_coefficients``), a Basalt JSON (``value0``), a JSON of cameras by name (``model``, ``params``),
-    nerfstudio's ``transforms.json`` (``fl_x``), COLMAP's ``cameras.txt``, OCamCalib's ``calib_results.txt`` and a TOML
-    with a ``[camera]`` table or with its keys at the top. ``name`` picks one of ``camera_names``, by default the first
-    one. ``size`` is that of the images, px, for a file of OpenCV that does not state it. Principal points that count
-    from the centre of the top-left pixel are moved by +0.5 pixels to this project's convention (that centre is
-    (0.5, 0.5)). A file of another kind is given to the readers of extensions (docs/extending.md).
+    and of scripts (``distortion_coefficients``, ``D`` and other names), a Basalt JSON (``value0``), a JSON of cameras
+    by name (``model``, ``params``), nerfstudio's ``transforms.json`` (``fl_x``), a JSON of WoodScape
+    (``intrinsic``), COLMAP's ``cameras.txt``, OCamCalib's ``calib_results.txt`` and a TOML with a ``[camera]`` table or
+    with its keys at the top. ``name`` picks one of ``camera_names``, by default the first one. ``size`` is that of the
+    images, px, for a file of OpenCV that does not state it. Principal points that count from the centre of the top-left
+    pixel are moved by +0.5 pixels to this project's convention (that centre is (0.5, 0.5)). A file of another kind is
+    given to the readers of extensions (docs/extending.md).
 
     Raises ``CalibrationError``, naming the file and the place, for whatever cannot be read as a usable camera.
     """
@@ -78,6 +78,23 @@ def camera_names(path: str | Path) -> tuple[str, ...]:
         if _looks_like_yaml(text):
             return tuple(tool_files.chain_tables(parse_yaml(text)))
         return tuple(colmap_lines(text))
+
+
+def about_calibration(path: str | Path, size: tuple[int, int] | None = None) -> str:
+    """What ``load_camera`` had to conclude about the lens of a file that does not say it, with the reason, as a
+    sentence without the file's name; empty if nothing. ``size`` is as there.
+
+    Raises ``CalibrationError``, naming the file, if it cannot be read.
+    """
+    with located(str(path)):
+        text = read_text(Path(path))
+        if text.lstrip().startswith("{"):
+            document = parse_json(text)
+        elif text.lstrip().startswith("<"):
+            document = parse_opencv_xml(text)
+        else:
+            document = parse_yaml(text) if _looks_like_yaml(text) else None
+        return about_opencv(document, size) if _reader_of(document) is opencv else ""
 
 
 def camera_from_table(table: Any, where: str) -> Camera:
@@ -132,6 +149,8 @@ def _from_json(document: Any, name: str | None, size: tuple[int, int] | None) ->
         return tool_files.basalt(document, name)
     if json_files.named_cameras(document):
         return json_files.camera_named(document, name)
+    if is_woodscape(document):
+        return woodscape(document, name)
     if json_files.is_transforms(document):
         _refuse_name(name)
         return json_files.transforms(document)
@@ -153,19 +172,25 @@ def _from_yaml(document: Any, name: str | None, size: tuple[int, int] | None) ->
 
 def _one_camera(document: Any, name: str | None, kind: str, size: tuple[int, int] | None) -> Camera:
     """The camera of a document that has one, without a name; raises ``UnrecognisedError`` if it has no known key."""
-    keys = {str(key) for key in document} if isinstance(document, dict) else set()
-    if any(key.startswith(tool_files.STELLA_PREFIX) for key in keys):
-        keys.add("Camera")
-    for mark, read in _ONE_CAMERA.items():
-        if mark in keys:
-            _refuse_name(name)
-            return opencv(document, size) if read is opencv else read(document)
-    if arrays := tool_files.opencv_arrays(document):
+    read = _reader_of(document)
+    if read is not None:
+        _refuse_name(name)
+        return opencv(document, size) if read is opencv else read(document)
+    if arrays := opencv_arrays(document):
         raise UnrecognisedError(
             f"has arrays of OpenCV by the names {', '.join(arrays)}: call those of one camera camera_matrix and "
             "distortion_coefficients, or K and D."
         )
     raise UnrecognisedError(f"this {kind} has no known key at its top: {KNOWN}.")
+
+
+def _reader_of(document: Any) -> Callable[[dict[Any, Any]], Camera] | None:
+    """What reads a document of one camera without a name; None if it has no known key."""
+    keys = {str(key) for key in document} if isinstance(document, dict) else set()
+    if any(key.startswith(tool_files.STELLA_PREFIX) for key in keys):
+        keys.add("Camera")
+    known = next((read for mark, read in _ONE_CAMERA.items() if mark in keys), None)
+    return known or (opencv if is_opencv(document) else None)
 
 
 def _from_toml(text: str, name: str | None) -> Camera:

@@ -1,4 +1,5 @@
-"""How the cameras of a calibration file are fixed to each other: Kalibr, Basalt, and a JSON of cameras by name."""
+"""How the cameras of a calibration file are fixed to each other: Kalibr, Basalt, a JSON of cameras by name, and
+WoodScape's JSONs, which have one camera each and the same body."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -6,24 +7,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from spherloc.cameras._checks import located
 from spherloc.cameras._files import numbers_of, parse_json, parse_yaml, read_text, table_of
 from spherloc.cameras.json_files import named_cameras
 from spherloc.cameras.tool_files import KalibrCamera, basalt_names, chain_tables, kalibr_chain, rigid
-from spherloc.errors import CalibrationError, show
+from spherloc.cameras.woodscape_files import is_woodscape, rigid_of, vehicle_from_camera, woodscape_name
+from spherloc.errors import CalibrationError
 from spherloc.types import FloatArray
 
 BODY_FROM_CAMERA = ("T_device_camera", "T_body_camera", "T_imu_cam", "T_BS")
 """Keys of such a transform in a JSON of cameras by name: the body is a device, such as glasses, or an IMU."""
-_UNIT = 1e-3
-"""Largest difference of a quaternion's length to 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigCalibration:
-    """How cameras are fixed to a body: an IMU, a device or one of the cameras."""
+    """How cameras are fixed to a body: an IMU, a device, a car or one of the cameras."""
 
     body_from_camera: Mapping[str, FloatArray] = field(default_factory=dict)
     """(4, 4), metres, by the name of the camera in the file; of those of which the file states it."""
@@ -43,6 +42,9 @@ def read_rig(path: Path) -> RigCalibration:
         if not text.lstrip().startswith("{"):
             return _of_chain(text)
         document = parse_json(text)
+        if is_woodscape(document):
+            placed = vehicle_from_camera(document)
+            return RigCalibration({} if placed is None else {woodscape_name(document): placed})
         names = basalt_names(document)
         if names:
             return _of_basalt(document, names)
@@ -66,7 +68,7 @@ def _of_chain(text: str) -> RigCalibration:
         return RigCalibration()
     chain = kalibr_chain(document)
     from_imu = _along(chain, None)
-    of_first = _along(chain, np.eye(4)) if not from_imu else {}
+    of_first = _along(chain, np.eye(4)) if not from_imu and len(chain) > 1 else {}
     found = {name: np.asarray(np.linalg.inv(there), np.float64) for name, there in (from_imu or of_first).items()}
     return RigCalibration(found, bool(from_imu), {name: one.timeshift_s for name, one in chain.items()})
 
@@ -99,9 +101,5 @@ def _of_basalt(document: Any, names: tuple[str, ...]) -> RigCalibration:
     for name, entry in zip(names, stated, strict=True):
         with located(f"T_imu_cam of {name}"):
             px, py, pz, *quaternion = numbers_of(table_of(entry), "px", "py", "pz", "qx", "qy", "qz", "qw")
-            length = float(np.linalg.norm(quaternion))
-            if abs(length - 1.0) > _UNIT:
-                raise CalibrationError(f"its quaternion is {show(length)} long: give one of length 1.")
-            found[name] = np.eye(4)
-            found[name][:3, :3], found[name][:3, 3] = Rotation.from_quat(quaternion).as_matrix(), (px, py, pz)
+            found[name] = rigid_of(tuple(quaternion), (px, py, pz))
     return RigCalibration(found, True)

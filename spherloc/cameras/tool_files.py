@@ -1,5 +1,4 @@
-"""Calibrations of Kalibr, KITTI-360, Basalt, stella_vslam (OpenVSLAM), 360Loc, fisheye-calib-adapter, OpenCV's samples
-and ROS.
+"""Calibrations of Kalibr, KITTI-360, Basalt, stella_vslam (OpenVSLAM), 360Loc and fisheye-calib-adapter.
 
 All but 360Loc put the centre of the top-left pixel at (0, 0): 0.5 is added to their principal points here.
 """
@@ -31,7 +30,7 @@ from spherloc.cameras.eucm import Eucm
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.cameras.ocam import Ocam
-from spherloc.errors import CalibrationError, shorten, show
+from spherloc.errors import CalibrationError, show
 from spherloc.types import FloatArray
 
 STELLA_PREFIX = "Camera."
@@ -370,113 +369,3 @@ def rigid(table: dict[Any, Any], key: str) -> FloatArray | None:
     if not (error < _ROTATION_TOLERANCE and right_handed and (matrix[3] == (0.0, 0.0, 0.0, 1.0)).all()):
         raise CalibrationError(f"key '{key}' is not a rotation with a translation: give a rigid 4 x 4 matrix.")
     return matrix
-
-
-_FISHEYE, _RADIAL = {"equidistant", "fisheye"}, {"plumb_bob", "radtan"}
-"""Values of ``distortion_model``."""
-_MAX_SKEW = 1e-6
-"""Largest skew of a camera matrix, as a share of the focal length."""
-
-
-OPENCV_2 = {
-    "Distortion_Coefficients": "distortion_coefficients",
-    "Camera_Matrix": "camera_matrix",
-    "image_Width": "image_width",
-    "image_Height": "image_height",
-}
-"""Keys of the samples of OpenCV 2, and what they are called since."""
-
-
-def opencv(document: dict[Any, Any], of_images: tuple[int, int] | None = None) -> Camera:
-    """A pinhole, a fisheye (``fisheye_model: 1``, or ROS's ``distortion_model: equidistant``) or MEI (``xi``).
-    Its matrices are called as OpenCV's samples call them, or K and D. ``of_images`` is the size, px, if it states none.
-
-    Raises ``CalibrationError`` for another file, and if its four coefficients may be those of a fisheye or a pinhole.
-    """
-    document = {OPENCV_2.get(key, key): value for key, value in document.items()}
-    if not document.keys() & {"image_width", "image_height"}:
-        if of_images is None:
-            raise CalibrationError("states no size of images: add the keys image_width and image_height.")
-        document |= {"image_width": of_images[0], "image_height": of_images[1]}
-    size = value_of(document, "image_width"), value_of(document, "image_height")
-    matrix, coefficients = ("K", "D") if "D" in document else ("camera_matrix", "distortion_coefficients")
-    with located(matrix):
-        fx, skew, cx, zero, fy, cy, *last = _matrix(value_of(document, matrix), 9)
-        if abs(skew) > _MAX_SKEW * abs(fx) or (zero, *last) != (0.0, 0.0, 0.0, 1.0):
-            raise CalibrationError("is not a matrix [fx 0 cx; 0 fy cy; 0 0 1]: give one without skew.")
-    with located(coefficients):
-        lens = _matrix(document[coefficients], None)
-    middle = cx + PIXEL_CENTRE_SHIFT, cy + PIXEL_CENTRE_SHIFT
-    if "xi" in document:
-        k1, k2, p1, p2 = _four(lens, "k1, k2, p1, p2")
-        return Mei(*size, fx, fy, *middle, _scalar(document["xi"]), (k1, k2, p1, p2))
-    if _is_fisheye(document, lens):
-        return KannalaBrandt(*size, fx, fy, *middle, _four(lens, "k1, k2, k3, k4"))
-    return Mei(*size, fx, fy, *middle, 0.0, _four(lens, "k1, k2, p1, p2"))
-
-
-def opencv_arrays(document: Any) -> list[str]:
-    """Names of the first arrays of OpenCV's FileStorage in a document."""
-    tables = (
-        {key: value for key, value in document.items() if isinstance(value, dict)} if isinstance(document, dict) else {}
-    )
-    arrays = [key for key, table in tables.items() if "data" in table and table.keys() & {"rows", "sizes"}]
-    return [shorten(str(key)) for key in arrays[:4]]
-
-
-def _is_fisheye(document: dict[Any, Any], lens: list[float]) -> bool:
-    model = document.get("distortion_model")
-    if isinstance(model, str) and model in _FISHEYE | _RADIAL:
-        return model in _FISHEYE
-    if model is not None:
-        known = ", ".join(sorted(_FISHEYE | _RADIAL))
-        raise CalibrationError(f"the distortion_model {show(model)} is not supported: give one of {known}.")
-    if "fisheye_model" in document:
-        return numbers_of(document, "fisheye_model") != [0.0]
-    if len(lens) == 4 and any(lens):
-        raise CalibrationError(
-            "the four distortion_coefficients may be those of a fisheye or of a pinhole: add distortion_model, "
-            "equidistant or plumb_bob."
-        )
-    return False
-
-
-def _four(lens: list[float], names: str) -> tuple[float, float, float, float]:
-    """The first four coefficients; the others must be zero, as the models have no more."""
-    padded = [*lens, 0.0, 0.0, 0.0, 0.0][: max(4, len(lens))]
-    if any(padded[4:]):
-        raise CalibrationError(f"distortion_coefficients has {len(lens)} numbers: calibrate with {names} alone.")
-    k1, k2, k3, k4 = padded[:4]
-    return k1, k2, k3, k4
-
-
-def _scalar(value: Any) -> float:
-    """``xi``, a number or a matrix of one."""
-    with located("xi"):
-        if isinstance(value, dict):
-            return _matrix(value, 1)[0]
-        return numbers_of({"xi": value}, "xi")[0]
-
-
-def _matrix(value: Any, count: int | None) -> list[float]:
-    """The numbers of a table ``rows``, ``cols``, ``data`` or ``sizes``, ``data``, row by row; ``count`` is how many
-    there must be."""
-    table = table_of(value)
-    sizes = list(_numbers(table, "sizes")) if "sizes" in table else numbers_of(table, "rows", "cols")
-    numbers = _numbers(table, "data")
-    if len(numbers) != np.prod(sizes) or (count is not None and len(numbers) != count):
-        wanted = f"{count}" if count is not None else "rows x cols"
-        rows, columns, *_ = *sizes, 1.0
-        raise CalibrationError(f"has {len(numbers)} numbers in {rows:g} rows and {columns:g} columns: give {wanted}.")
-    return np.array(numbers, dtype=np.float64).tolist()
-
-
-def _numbers(table: dict[Any, Any], key: str) -> tuple[float, ...]:
-    """The finite numbers in the list under ``key``, which may be empty."""
-    values = value_of(table, key)
-    return () if isinstance(values, list) and not values else list_of(table, key, _names(values))
-
-
-def _names(data: Any) -> str:
-    """Names m0, m1, ..., one for each entry of a list, for the messages of ``list_of``."""
-    return ", ".join(f"m{place}" for place in range(min(len(data), 100))) if isinstance(data, list) else "m0"

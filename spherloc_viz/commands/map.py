@@ -38,13 +38,13 @@ from spherloc.mapping.alignment.sequence import sequence_data
 from spherloc.mapping.alignment.stated_gravity import read_stated_gravity
 from spherloc.mapping.alignment.tag_gravity import stated_by_tags
 from spherloc.mapping.alignment.true_poses import truth_words
+from spherloc.mapping.images.found_calibrations import calibrations_in
 from spherloc.mapping.images.frames import FRAMES, FrameChoice, frames_of
 from spherloc.mapping.images.given_cameras import given_cameras
 from spherloc.mapping.images.photographs import (
     CalibratedLens,
     LensFinder,
     Photographs,
-    calibrations_in,
     cameras_of,
     photographs,
 )

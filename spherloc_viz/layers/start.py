@@ -189,5 +189,6 @@ def _lens_equation(model: str) -> str:
         "double_sphere": "m = (x, y), mz from ξ and α; v = s (m, mz) − (0, 0, ξ)   (Usenko et al. 2018)",
         "eucm": "v ∝ (x, y, mz(α, β, x² + y²))   (Khomutenko et al. 2015)",
         "ocam": "v ∝ (x, y, a0 + a1 r + a2 r² + …)   (Scaramuzza et al. 2006)",
+        "radial_poly": "θd = θ(1 + d1θ + d2θ² + d3θ³)   (Yogamani et al. 2019)",
         "equirectangular": "lon = 2π(u/W − ½), lat = π(½ − v/H)   (Eq. 15-17)",
     }.get(model, "")

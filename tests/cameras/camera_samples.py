@@ -14,6 +14,7 @@ from spherloc.cameras.fisheye624 import Fisheye624
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.cameras.ocam import Ocam
+from spherloc.cameras.radial_poly import RadialPoly
 from tests.needs import DATA, real_data
 
 KITTI360_IMAGE_02 = Mei(
@@ -69,6 +70,11 @@ INLINE: dict[str, Camera] = {
         (1.0, -0.000071, -0.000325, 0.999134),
         (289.5569, 0.0, -1.538894e-3, 3.140320e-6, -7.206996e-9),
     ),
+    "radial-poly-woodscape": RadialPoly(
+        *(1280, 966, 339.749, 339.749, 643.942, 479.907),
+        (-31.988 / 339.749, 48.275 / 339.749, -7.201 / 339.749),
+    ),
+    "radial-poly-with-an-end": RadialPoly(1280, 966, 281.85, 280.0, 640.0, 483.0, (0.033, -0.0198, -0.0051)),
     "624-aria-rgb": Fisheye624(
         1408,
         1408,

@@ -13,6 +13,7 @@ from spherloc.cameras.mei import Mei
 from spherloc.cameras.scaling import scaled
 from spherloc.errors import CalibrationError
 from spherloc.mapping.images.given_cameras import given_cameras
+from spherloc.mapping.images.photographs import photographs as find_photographs
 
 FOCAL = 1280, 960, 400.0, 402.0, 650.0, 470.0
 FISHEYE = KannalaBrandt(*FOCAL, (0.01, -0.002, 0.001, 0.0))
@@ -83,3 +84,17 @@ def test_a_file_of_opencv_without_a_size_has_that_of_the_photographs(tmp_path, p
 def test_an_image_is_no_calibration(photographs):
     with pytest.raises(CalibrationError, match=r"a\.png: is an image: give the file with the calibration"):
         load_camera(photographs / "a.png")
+
+
+def test_what_four_coefficients_are_taken_for_is_told(photographs):
+    """Of a file that is given, which has no size, and of one beside the photographs."""
+    text = "camera_matrix: [[400, 0, 320], [0, 400, 240], [0, 0, 1]]\ndist_coeffs: [0.1, 0.02, -0.03, 0.0]\n"
+    file = photographs.parent / "front.yaml"
+    file.write_text(text)
+    cameras, remarks = given_cameras(file, None, photographs)
+    assert isinstance(cameras[""], KannalaBrandt) and len(remarks) == 2 and "states no size" in remarks[0]
+    assert remarks[1].startswith(f"{file}: its four coefficients are taken for those of a fisheye (cv2.fisheye), since")
+    (photographs / "front.yaml").write_text(f"{text}resolution: [640, 480]\n")
+    found = find_photographs(photographs, {})
+    assert found.remarks[0] == "The calibration found beside them: front."
+    assert found.remarks[1].startswith("front: its four coefficients are taken for those of a fisheye")

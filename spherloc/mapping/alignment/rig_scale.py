@@ -33,8 +33,14 @@ from spherloc.mapping.advice import advice
 from spherloc.mapping.alignment.positions import MAX_SCALE_SD, NEAR_SD
 from spherloc.mapping.alignment.sequence import shots_of_sequence
 from spherloc.mapping.alignment.upright import MapScale
+from spherloc.mapping.images.found_calibrations import (
+    CALIBRATIONS,
+    CALLED_CALIBRATION,
+    MAX_CALIBRATIONS,
+    own_files,
+)
 from spherloc.mapping.images.lens import for_colmap
-from spherloc.mapping.images.photographs import CALIBRATIONS, CALLED_CALIBRATION, MAX_CALIBRATIONS, is_called
+from spherloc.mapping.images.photographs import is_called
 from spherloc.mapping.rig import TURNED_RAD, Key, camera_and_key, taken_together
 from spherloc.types import FloatArray
 
@@ -75,7 +81,8 @@ def fixed_images(folder: Path, views: Sequence[View], file: Path | None) -> tupl
     """How the cameras of ``views``, photographs in ``folder``, are fixed to each other, None if no calibration says it
     or if the images are of one camera; and remarks on what cannot be used.
 
-    The calibration is ``file``, else that of a sequence in the ASL layout, else a file in ``folder``.
+    The calibration is ``file``, else that of a sequence in the ASL layout, else one of each image, else a file in
+    ``folder``.
     """
     sequence = None if file is not None else asl_sequence(folder)
     if sequence is not None:
@@ -85,8 +92,11 @@ def fixed_images(folder: Path, views: Sequence[View], file: Path | None) -> tupl
                 placed[shot.name] = (shot.camera, shot.calibrated.body_from_camera)
                 files.add(sequence.called(shot.calibrated.file))
         return _together(views, placed, " and ".join(sorted(files))), []
-    remarks: list[str] = []
+    placed, remarks = _placed_by_own_files(views) if file is None else ({}, [])
+    if len({camera for camera, _ in placed.values()}) > 1:
+        return _together(views, placed, "the calibration of each image"), remarks
     names = [] if file is not None else [name for name in names_in(folder) if Path(name).suffix.lower() in CALIBRATIONS]
+    alone: dict[str, FloatArray] = {}  # of files with one camera, by their names, fixed to the same body
     for path in [folder / name for name in names[:MAX_CALIBRATIONS]] if file is None else [file]:
         try:
             rig = read_rig(path)
@@ -96,7 +106,37 @@ def fixed_images(folder: Path, views: Sequence[View], file: Path | None) -> tupl
             continue
         if len(rig.body_from_camera) > 1 and (found := _together(views, _placed(path, rig, views), shorten(path.name))):
             return found, remarks
+        if len(rig.body_from_camera) == 1:
+            (alone[path.stem],) = rig.body_from_camera.values()
+    placed = {}
+    for view in views:
+        if called := sorted((name for name in alone if _says(view.name, name)), key=len)[-1:]:
+            placed[view.name] = (called[0], alone[called[0]])
+    files = sorted({camera for camera, _ in placed.values()})
+    if len(files) > 1:
+        return _together(views, placed, f"the calibration of {' and of '.join(map(shorten, files))}"), remarks
     return None, remarks
+
+
+def _placed_by_own_files(views: Sequence[View]) -> tuple[dict[str, tuple[str, FloatArray]], list[str]]:
+    """The camera's name and ``body_from_camera`` (4, 4) of the images whose own calibrations say it, and the first
+    remark on those that cannot be used."""
+    folders: dict[Path, dict[str, str]] = {}
+    for view in views:
+        folders.setdefault(view.path.parent, {})[view.path.name] = view.name
+    placed: dict[str, tuple[str, FloatArray]] = {}
+    remarks: list[str] = []
+    for folder, names in folders.items():
+        for image, path in own_files(folder, list(names)).items():
+            try:
+                rig = read_rig(path).body_from_camera
+            except CalibrationError as error:
+                remarks.append(f"{error} It is not used for the scale.")
+                continue
+            if len(rig) == 1:
+                ((camera, matrix),) = rig.items()
+                placed[names[image]] = (camera or camera_and_key(image)[0], matrix)
+    return placed, remarks[:1] if placed else []
 
 
 def _placed(path: Path, rig: RigCalibration, views: Sequence[View]) -> dict[str, tuple[str, FloatArray]]:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from spherloc.cameras.base import Camera
-from spherloc.cameras.calibration import camera_names, load_camera
+from spherloc.cameras.calibration import about_calibration, camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.scaling import scaled
 from spherloc.errors import CalibrationError, InputError, show
@@ -34,6 +34,8 @@ def given_cameras(file: Path, name: str | None, folder: Path) -> tuple[dict[str,
             (size,) = sizes
             cameras[one or ""] = load_camera(file, one, size)
             remarks.append(f"{file}: states no size of images; {_px(size)}, that of the photographs, are taken.")
+    if about := about_calibration(file, next(iter(sizes)) if len(sizes) == 1 else None):
+        remarks.append(f"{file}: {about}")
     if sizes and not any((camera.width, camera.height) in sizes for camera in cameras.values()):
         cameras, about = _scaled(file, cameras, sizes.most_common(1)[0][0])
         remarks += about

@@ -7,18 +7,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 from spherloc.cameras.base import Camera
-from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.principal_point import about_principal_point
 from spherloc.datasets.asl import asl_cameras, image_times
 from spherloc.datasets.asl_layout import DATA, SENSOR, AslSequence, asl_sequence, of_all_cameras
 from spherloc.datasets.given_path import images_in_folders
-from spherloc.errors import InputError, SpherlocError, shorten
+from spherloc.errors import InputError, shorten
 from spherloc.files import is_folder, is_image, names_in
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
 from spherloc.images import DamagedImageError, check_image, is_turned
 from spherloc.mapping.advice import advice
+from spherloc.mapping.images.found_calibrations import FoundCalibrations, calibrations_in, calibrations_of
 from spherloc.mapping.images.frames import MAX_IMAGES, FrameChoice, ImageFolder, chosen
 from spherloc.mapping.images.full_panorama import full_panoramas, near_two_to_one
 from spherloc.mapping.images.left_out import (
@@ -39,11 +39,6 @@ from spherloc.mapping.images.lens import for_colmap
 from spherloc.trajectory import NS_PER_S
 
 MIN_IMAGES = 2
-CALIBRATIONS = (".yaml", ".yml", ".json", ".toml", ".txt", ".xml")
-CALLED_CALIBRATION = re.compile("calib|camera|camchain|intrinsic|sensor|lens|cam[0-9]*$")
-"""Names of files that are taken for calibrations, so that one that cannot be read is told."""
-MAX_CALIBRATIONS = 20
-"""Largest number of files beside the photographs that are tried as a calibration."""
 
 
 class CalibratedLens(NamedTuple):
@@ -152,19 +147,19 @@ def with_cameras(
     views: list[View] = []
     calibrated: dict[str, CalibratedLens] = {}
     if sequence is None and not places[0].inside:
-        beside = calibrations_in(folder)
+        beside = calibrations_in(folder, images=_images_of(places[0]))
         known = known or dict(beside.cameras)
         views, about, lens = _of_folder(folder, places[0], cameras, beside, panorama, find_lens, of_map)
         calibrated |= {} if lens is None else {"": lens}
         remarks += [*about, *about_subfolders(inside)]
         return Photographs(tuple(views), tuple(remarks), known, calibrated, others)
     folders = [place.camera for place in places]
-    shared = {} if sequence else _of_files([folder / name for name in there], least=2).cameras
+    shared = {} if sequence else calibrations_of([folder / name for name in there], least=2).cameras
     for place in places:
         try:
             given, common = (_belonging(some, place.camera, folders) for some in (cameras, shared))
             mapped = None if of_map is None else _belonging(of_map, place.camera, folders)
-            beside = own[place.camera] if sequence else calibrations_in(folder, place.camera)
+            beside = own[place.camera] if sequence else calibrations_in(folder, place.camera, _images_of(place))
             if not beside.cameras:
                 beside = replace(beside, cameras=common)
             found, about, lens = _of_folder(folder, place, given, beside, panorama, find_lens, mapped)
@@ -183,7 +178,7 @@ def with_cameras(
 
 def _of_sequence(
     root: Path, sequence: AslSequence
-) -> tuple[list[ImageFolder], dict[str, "FoundCalibrations"], list[str]]:
+) -> tuple[list[ImageFolder], dict[str, FoundCalibrations], list[str]]:
     """The image folders of a sequence in ``root``, their calibrations by the name of the camera, and remarks."""
     known = asl_cameras(sequence)
     places, calibrations, remarks = [], {}, list(known.remarks)
@@ -196,7 +191,7 @@ def _of_sequence(
         own = known.by_name.get(name)
         if own is None:
             others = [place / file for place in (images, images.parent) for file in names_in(place) if file != SENSOR]
-            calibrations[name] = _of_files(others)
+            calibrations[name] = calibrations_of(others)
         else:
             calibrations[name] = FoundCalibrations({sequence.called(own.file): own.camera})
         remarks += times.remarks
@@ -212,6 +207,10 @@ def _about_other_cameras(folder: Path) -> list[str]:
         f"These are the images of {some_of(tuple(sequence.cameras))} of a recorded sequence; for a map of all of its "
         f"cameras, {some_of(tuple(whole.cameras))}, {advice('all cameras').format(folder=whole.folder)}."
     ]
+
+
+def _images_of(place: ImageFolder) -> list[str]:
+    return [name for name in place.names if is_image(name)]
 
 
 def cameras_of(views: Sequence[View]) -> dict[str, Camera]:
@@ -251,7 +250,7 @@ def _of_folder(
     root: Path,
     place: ImageFolder,
     given: Mapping[str, Camera],
-    beside: "FoundCalibrations",
+    beside: FoundCalibrations,
     panorama: bool,
     find_lens: LensFinder | None,
     of_map: Mapping[str, Camera] | None,
@@ -289,7 +288,9 @@ def _of_folder(
     resized: list[str] = []
     shapes: list[str] = []
     for size, names in sizes.items():
-        found, about = _with_cameras(names, size, cameras)
+        own = {} if given else _own_cameras(names, size, beside, cameras)
+        found, about = _with_cameras([name for name in names if name not in own], size, cameras)
+        found |= own
         if of_map:
             others_of_map, about_them = _with_cameras([name for name in names if name not in found], size, of_map)
             found, about = found | others_of_map, about + about_them
@@ -304,6 +305,8 @@ def _of_folder(
     used = [name for name, camera in cameras.items() if any(camera is one for one in camera_of.values())]
     if used and not given:
         remarks.append(f"The calibration found beside them: {', '.join(map(shorten, used))}.")
+        remarks += [f"{shorten(name)}: {beside.concluded[name]}" for name in used if name in beside.concluded]
+        remarks += beside.of_image_refused[:MAX_NAMED]
     remarks += [about for name in used if (about := about_principal_point(name, cameras[name]))]
     unused = [] if given or used or panorama else beside.unused(sizes)
     remarks += unused
@@ -383,10 +386,21 @@ def _sizes(cameras: Collection[Camera]) -> str:
     return " and ".join(f"{width} x {height}" for width, height in sizes[:MAX_NAMED])
 
 
+def _own_cameras(
+    names: Sequence[str], size: tuple[int, int], beside: FoundCalibrations, cameras: Mapping[str, Camera]
+) -> dict[str, Camera]:
+    """Those of ``cameras`` of images of one size whose own files hold them, by the image's name."""
+    found = {name: beside.of_image[name] for name in names if name in beside.of_image}
+    usable = {id(camera) for camera in cameras.values() if (camera.width, camera.height) == size}
+    return {name: camera for name, camera in found.items() if id(camera) in usable}
+
+
 def _with_cameras(
     names: Sequence[str], size: tuple[int, int], cameras: Mapping[str, Camera]
 ) -> tuple[dict[str, Camera], list[str]]:
     """The cameras of images of one size, by the image's name, and remarks."""
+    if not names:
+        return {}, []
     fitting = {name: camera for name, camera in cameras.items() if (camera.width, camera.height) == size}
     if not fitting:
         return {}, []
@@ -413,54 +427,3 @@ def is_called(camera: str, image: str) -> bool:
     plain, word = (name.lower().replace("_", "-") for name in (image, camera))
     after = "0-9" if word[-1].isdigit() else "a-z"
     return re.search(f"(?<![a-z0-9]){re.escape(word)}(?![{after}])", plain) is not None
-
-
-@dataclass(frozen=True)
-class FoundCalibrations:
-    """What calibration files beside images hold."""
-
-    cameras: Mapping[str, Camera]
-    """By the name of the file or, if it has several, of the camera in it."""
-    refused: tuple[str, ...] = ()
-    """Why files are not read that are called as calibrations are, a sentence each."""
-
-    def unused(self, sizes: Collection[tuple[int, int]]) -> list[str]:
-        """Why none of it is used for images of these sizes, a sentence each."""
-        others = [
-            f"{shorten(name)} is of {camera.width} x {camera.height}"
-            for name, camera in self.cameras.items()
-            if (camera.width, camera.height) not in sizes
-        ]
-        if not others:
-            return list(self.refused[:MAX_NAMED])
-        told = (
-            f"The calibration beside them is not used ({', '.join(others[:MAX_NAMED])} pixels), as no photograph there"
-        )
-        turned = any((camera.height, camera.width) in sizes for camera in self.cameras.values())
-        what = "turn the photographs by 90°, or calibrate anew" if turned else advice("another size")
-        return [f"{told} has its size: {what}.", *self.refused[:MAX_NAMED]]
-
-
-def calibrations_in(root: Path, inside: str = "") -> FoundCalibrations:
-    """Cameras of the calibration files in ``root`` or, with ``inside``, in that folder there, and of one beside it that
-    has its name."""
-    files = [root / inside / name for name in names_in(root / inside)]
-    files += [root / name for name in names_in(root) if inside and Path(name).stem == inside]
-    return _of_files(files)
-
-
-def _of_files(files: Sequence[Path], least: int = 1) -> FoundCalibrations:
-    """What those of the files hold that are calibrations of at least so many cameras."""
-    found: dict[str, Camera] = {}
-    refused = []
-    for path in [path for path in files if path.suffix.lower() in CALIBRATIONS][:MAX_CALIBRATIONS]:
-        try:
-            names = camera_names(path)
-            if len(names) > 1:
-                found |= {name: load_camera(path, name) for name in names}
-            elif least <= 1:
-                found[path.stem] = load_camera(path)
-        except SpherlocError as error:  # not a calibration, but for its name
-            if CALLED_CALIBRATION.search(path.stem.lower()):
-                refused.append(f"A file beside them is not used: {error}")
-    return FoundCalibrations(found, tuple(refused))
