@@ -199,6 +199,11 @@ def size_of(table: dict[Any, Any], key: str) -> tuple[Any, Any]:
     return size[0], size[1]
 
 
+def whole(side: float) -> Any:
+    """A side of an image, px, as an integer if it is one that a file has as a number with a point."""
+    return int(side) if side.is_integer() else side
+
+
 def _number(value: Any) -> Any:
     """The value as a number if it is one that YAML 1.1 takes for text, such as 1e-3, which has no point."""
     try:

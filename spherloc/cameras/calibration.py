@@ -93,7 +93,7 @@ def about_calibration(path: str | Path, size: tuple[int, int] | None = None) -> 
         elif text.lstrip().startswith("<"):
             document = parse_opencv_xml(text)
         else:
-            document = parse_yaml(text) if _looks_like_yaml(text) else None
+            document = parse_yaml(text) if _looks_like_yaml(text) else {}
         return about_opencv(document, size) if _reader_of(document) is opencv else ""
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from spherloc.cameras._checks import located
-from spherloc.cameras._files import PIXEL_CENTRE_SHIFT, list_of, numbers_of, size_of, value_of
+from spherloc.cameras._files import PIXEL_CENTRE_SHIFT, list_of, numbers_of, value_of, whole
 from spherloc.cameras.base import Camera
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
@@ -117,8 +117,8 @@ def _size(document: dict[Any, Any], of_images: tuple[int, int] | None) -> tuple[
     name = _first(document, _SIZES)
     if name is not None:
         with located(name):
-            sides = _matrix(document[name], 2)
-        return size_of({name: [int(side) if side.is_integer() else side for side in sides]}, name)
+            width, height = _matrix(document[name], 2)
+        return whole(width), whole(height)
     if of_images is None:
         raise CalibrationError("states no size of images: add the keys image_width and image_height.")
     return of_images

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from spherloc.cameras._checks import located, positive
-from spherloc.cameras._files import list_of, numbers_of, table_of
+from spherloc.cameras._files import list_of, numbers_of, table_of, whole
 from spherloc.cameras.radial_poly import RadialPoly
 from spherloc.errors import CalibrationError, show
 from spherloc.types import FloatArray
@@ -46,9 +46,10 @@ def woodscape(document: dict[Any, Any], name: str | None) -> RadialPoly:
         (aspect,) = numbers_of({"aspect_ratio": 1.0} | table, "aspect_ratio")
         focal, aspect = positive("k1", k1), positive("aspect_ratio", aspect)
         width, height = numbers_of(table, "width", "height")
-        sides = [int(side) if side.is_integer() else side for side in (width, height)]
         middle = 0.5 * width + right, 0.5 * height + down
-        return RadialPoly(*sides, focal, focal * aspect, *middle, (k2 / focal, k3 / focal, k4 / focal))
+        return RadialPoly(
+            whole(width), whole(height), focal, focal * aspect, *middle, (k2 / focal, k3 / focal, k4 / focal)
+        )
 
 
 def woodscape_name(document: dict[Any, Any]) -> str:

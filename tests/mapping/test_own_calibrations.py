@@ -109,13 +109,18 @@ def test_cameras_of_two_cars_are_told_apart(car):
     }
 
 
-def test_only_the_files_of_images_that_are_mapped_are_read(car, monkeypatch):
-    folder, read = car("calibration"), []
+@pytest.mark.parametrize("layout", ["calibration", "rgb_images"])
+def test_only_the_files_of_images_that_are_mapped_are_read(car, monkeypatch, layout):
+    folder, read = car(layout), []
     for number in range(1000, 4000):
-        (folder.parent / "calibration" / f"{number:05d}_FV.json").write_text("{")
+        (folder.parent / layout / f"{number:05d}_FV.json").write_text("{")
+        if layout == "rgb_images":
+            (folder / f"{number:05d}_FV.png").write_bytes(b"")
     load = calibration.load_camera
     monkeypatch.setattr(found_calibrations, "load_camera", lambda path, *more: read.append(path) or load(path, *more))
-    assert len(photographs(folder, {}).views) == TIMES * len(CAMERAS) == len(read)
+    images = [f"{time:05d}_{camera}.png" for time in range(TIMES) for camera in CAMERAS]
+    found = calibrations_in(folder, images=images)
+    assert list(found.of_image) == images and len(read) == len(images) and len(found.cameras) == 1
 
 
 def test_other_files_that_are_called_as_images_are_no_calibrations(car, rng):

@@ -93,8 +93,9 @@ def fixed_images(folder: Path, views: Sequence[View], file: Path | None) -> tupl
                 files.add(sequence.called(shot.calibrated.file))
         return _together(views, placed, " and ".join(sorted(files))), []
     placed, remarks = _placed_by_own_files(views) if file is None else ({}, [])
-    if len({camera for camera, _ in placed.values()}) > 1:
-        return _together(views, placed, "the calibration of each image"), remarks
+    if placed:
+        several = len({camera for camera, _ in placed.values()}) > 1
+        return _together(views, placed, "the calibration of each image") if several else None, remarks
     names = [] if file is not None else [name for name in names_in(folder) if Path(name).suffix.lower() in CALIBRATIONS]
     alone: dict[str, FloatArray] = {}  # of files with one camera, by their names, fixed to the same body
     for path in [folder / name for name in names[:MAX_CALIBRATIONS]] if file is None else [file]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import about_calibration, camera_names, load_camera
 from spherloc.errors import SpherlocError, shorten
-from spherloc.files import is_folder, names_in
+from spherloc.files import is_folder, is_image, names_in
 from spherloc.mapping.advice import advice
 from spherloc.mapping.images.left_out import MAX_NAMED
 from spherloc.mapping.rig import camera_and_key
@@ -64,13 +64,16 @@ class FoundCalibrations:
 def calibrations_in(root: Path, inside: str = "", images: Sequence[str] = ()) -> FoundCalibrations:
     """Cameras of the calibration files in ``root`` or, with ``inside``, in that folder there, and of one beside it that
     has its name; and those of the files of single ``images`` there, by name."""
-    files = [root / inside / name for name in names_in(root / inside)]
+    there = names_in(root / inside)
+    files = [root / inside / name for name in there]
     files += [root / name for name in names_in(root) if inside and Path(name).stem == inside]
     own = _own(root / inside, images)
-    # A file of one of many images of a camera says nothing of others.
-    found = calibrations_of([path for path in files if path not in own.series])
-    cameras = {**found.cameras, **own.cameras}
-    return FoundCalibrations(cameras, found.refused, found.concluded | own.concluded, own.of_image, own.refused)
+    if own.series:  # the files of other images say nothing of these
+        stems = {Path(name).stem for name in there if is_image(name)}
+        files = [path for path in files if path.stem not in stems]
+    found = calibrations_of(files)
+    cameras, concluded = {**found.cameras, **own.cameras}, {**found.concluded, **own.concluded}
+    return FoundCalibrations(cameras, found.refused, concluded, own.of_image, own.refused)
 
 
 def own_files(folder: Path, images: Sequence[str]) -> dict[str, Path]:
@@ -94,8 +97,8 @@ class _OwnCalibrations(NamedTuple):
     cameras: Mapping[str, Camera]
     """Different ones: by what their images are called but for a number, or the name of the file of a single image."""
     of_image: Mapping[str, Camera]
-    series: frozenset[Path]
-    """The files of cameras of several images."""
+    series: bool
+    """Whether a camera is that of several images."""
     concluded: Mapping[str, str]
     """As in ``FoundCalibrations``."""
     refused: tuple[str, ...]
@@ -127,7 +130,7 @@ def _own(folder: Path, images: Sequence[str]) -> _OwnCalibrations:
         if about := about_calibration(file):
             concluded[called] = about
     of_image = {name: camera for camera, names in taken.values() for name in names}
-    series = frozenset(files[name] for _, names in taken.values() if len(names) > 1 for name in names)
+    series = any(len(names) > 1 for _, names in taken.values())
     return _OwnCalibrations(cameras, of_image, series, concluded, tuple(refused) if taken else ())
 
 
