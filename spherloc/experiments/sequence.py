@@ -132,7 +132,7 @@ def inputs_of(view: View) -> str:
 
 
 def _match(scene: MapScene, view: View) -> tuple[Matches | SpherlocError, float]:
-    return _timed(lambda: scene.matcher(view))
+    return _timed(lambda: scene.matches(view))
 
 
 def _timed(matched: Callable[[], Matches]) -> tuple[Matches | SpherlocError, float]:

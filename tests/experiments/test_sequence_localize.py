@@ -153,7 +153,19 @@ def test_a_bug_in_a_matcher_is_not_hidden(tmp_path: Path) -> None:
         raise ZeroDivisionError("a bug")
 
     with pytest.raises(ZeroDivisionError):
-        solve(replace(scene_of(tmp_path), matcher=broken))
+        solve(replace(scene_of(tmp_path), matcher=broken, kind="rendered"))
+
+
+@pytest.mark.usefixtures("drawn")
+def test_a_bug_in_an_extension_costs_its_query_and_names_it(tmp_path: Path) -> None:
+    scene = scene_of(tmp_path, queries=3, crashing=[1])
+    rows = [row for row, _ in solve(scene)]
+    assert [row.status for row in rows] == ["localized", "failed", "localized"]
+    assert (
+        "scene.toml: the dataset 'drawn' of the extension drawn-matches failed (KeyError: 'depth')" in rows[1].message
+    )
+    with pytest.raises(InputError, match="of the extension drawn-matches failed"):
+        scene.problem(query="image1.png")
 
 
 def sequence_of(count: int):
