@@ -290,9 +290,13 @@ def check_dataset(scene: str | Path, loader: Callable[[dict[str, Any], Path], An
     table = read_table(path)
     subject = Subject(f"the dataset {show(table.get('kind'))}")
     load = loader or loader_of(str(table.get("kind")))
-    found = load(dict(table), path) if loader else load_scene(path)
+    try:
+        found = load(dict(table), path) if loader else load_scene(path)
+        problem = found.problem()
+    except Exception as error:
+        cause = error.__cause__ or error
+        raise AssertionError(f"the dataset {show(table.get('kind'))} raises {cause!r} for {path}.") from cause
     subject.need(isinstance(found.name, str) and found.name.isprintable() and bool(found.name), f"names {path} badly")
-    problem = found.problem()
     subject.need(isinstance(problem, Problem), f"gives {show(problem)} for {path}, which is not a Problem")
     changed = difference(problem, found.problem(), "the problem")
     subject.need(not changed, f"gives another problem when it is asked again: {changed} of {path} differs")

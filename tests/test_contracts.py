@@ -260,7 +260,11 @@ def test_broken_datasets_are_refused(tmp_path: Path) -> None:
         draw = type("Restless", (), {"name": scene.name, "problem": lambda self: scene.problem(next(number))})
         return draw()
 
+    def failing(table, path):
+        return type("Failing", (), {"name": "failing", "problem": lambda self: {}["depth"]})()
+
     assert "takes an unknown key with no_such_key = 1" in refusal(check_dataset, path, lenient)
+    assert f"the dataset 'synthetic' raises KeyError('depth') for {path}." == refusal(check_dataset, path, failing)
     assert "raises AttributeError(" in refusal(check_dataset, path, crashing)
     assert "gives another problem when it is asked again: the problem.pixels" in refusal(check_dataset, path, restless)
     assert "is not a Problem" in refusal(

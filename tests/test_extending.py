@@ -9,18 +9,30 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets import bundled_scenes, load_scene
+from spherloc.worlds import build_world
+from spherloc.worlds.render import draw
 from tests.installed import SEVERAL, python
 from tests.waiting import LIMIT_S
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
 FILE = re.compile(r"^`([\w./-]+)`\n\n```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 COMMANDS = re.compile(r"^```sh\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-PACKAGES = {"stereographic-lens", "acme-calibration", "dlt-solver", "guess-estimator", "npz-scenes", "guess-layer"}
+PACKAGES = {
+    "stereographic-lens",
+    "acme-calibration",
+    "dlt-solver",
+    "guess-estimator",
+    "npz-scenes",
+    "frame-scenes",
+    "guess-layer",
+}
 BUILD = """
 import os, sys
 from setuptools import build_meta
@@ -41,6 +53,7 @@ check_estimator("ransac-dlt")
 check_estimator("guess")
 check_dataset("matches.toml")
 check_dataset("stereographic.toml")
+check_dataset("frames.toml")
 """
 PAINT = """
 import json
@@ -77,7 +90,23 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     problem = load_scene(bundled_scenes()["panorama_outliers_80"]).problem()
     names = ("pixels", "points", "gravity_camera", "gravity_map")
     np.savez(folder / "matches.npz", **{name: getattr(problem, name) for name in names})
+    write_frames(folder)
     return folder
+
+
+def write_frames(folder: Path) -> None:
+    """The images, depth maps and poses of ``frames.toml``: three references and a query in a drawn street."""
+    world, camera = build_world("street"), Equirectangular(512, 256)
+    frames = []
+    for number, cam_from_map in enumerate(world.route(4, start=0.4, stop=0.5)):
+        drawn, name = draw(world, camera, cam_from_map), f"frame_{number}"
+        (folder / f"{name}.png").write_bytes(cv2.imencode(".png", drawn.image)[1].tobytes())
+        frame = {"image": f"{name}.png", "cam_from_map": cam_from_map.tolist()}
+        if number != 2:
+            np.save(folder / f"{name}.npy", drawn.range_m)
+            frame["depth"] = f"{name}.npy"
+        frames.append(frame)
+    (folder / "frames.json").write_text(json.dumps(frames))
 
 
 def commands(page: str) -> list[list[str]]:
@@ -107,15 +136,19 @@ def test_the_packages_keep_the_contracts_and_the_layer_draws(told: tuple[list[An
 
 def test_the_commands_of_the_page_work(place: Path, told: tuple[list[Any], list[Any]]) -> None:
     """The last recording is one with the layer, the last command the list of what is installed."""
-    assert {words[0] for words, *_ in told[1]} == {"run", "scenes", "plugins"}
+    assert {words[0] for words, *_ in told[1]} == {"run", "scenes", "localize", "plugins"}
     recordings = []
     for words, code, output, errors in told[1]:
         assert code == 0, (words, errors)
         if words[0] == "run":
             assert "matches are inliers" in output and "doubtful" not in output
             recordings += re.findall(r"recorded: (.*)", output)
-        elif words[0] == "scenes":
+        elif words == ["scenes", "npz"]:
             assert "Matches in a file of numpy" in output and 'matches = "matches.npz"' in output
+        elif words == ["scenes", "frames"]:
+            assert "Frames in a JSON file" in output and 'frames = "frames.json"' in output
+        elif words[0] == "localize":
+            assert "1 of 1 queries are localized" in output and "success within 1 deg, 0.1 m: 100.0 %" in output
     listed = told[1][-1][2]
     assert listed.count(": usable; ") == len(PACKAGES) and "cannot be used" not in listed
     assert "guess: usable; guess-layer 1.0, guess_layer:GUESSES" in listed

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from spherloc import registry
 from spherloc.cameras.principal_point import about_principal_points
 from spherloc.datasets import scene_file
 from spherloc.datasets.query_gravity import BOUND_SD, GravitySettings, MeasuredGravity, read_gravity
@@ -85,6 +86,9 @@ class MapScene:
     """What the loader skipped and why, in sentences."""
     matched_files: tuple[Path, ...] = ()
     """Files of another program that matches are read from."""
+    kind: str = ""
+    """The kind of its scene file, by which an extension is named whose own code fails while it matches; empty for a
+    scene without a file."""
 
     def __post_init__(self) -> None:
         for what, views in (("query", self.queries), ("reference", self.references)):
@@ -126,7 +130,16 @@ class MapScene:
     def prepare(self, report: Report) -> None:
         """Do what is needed once for all queries, so that it can be watched: describing a large map takes a while."""
         if isinstance(self.matcher, NeedsPreparing):
-            self.matcher.prepare(report)
+            with registry.guarded("datasets", self.kind, self.where):
+                self.matcher.prepare(report)
+
+    def matches(self, view: View) -> Matches:
+        """The correspondences of a query image, which ``matcher`` finds.
+
+        Raises ``InputError`` as that does, and for whatever the scene's parts raise that an extension made.
+        """
+        with registry.guarded("datasets", self.kind, self.where):
+            return self.matcher(view)
 
     def problem(self, seed: int | None = None, query: str | None = None) -> Problem:
         """The localization problem of a query image; images have nothing random, so ``seed`` changes nothing.
@@ -134,7 +147,7 @@ class MapScene:
         Raises ``InputError`` if the image cannot be used, or if it has too few correspondences for a problem.
         """
         view = self.query(query)
-        return self.problem_of(view, self.matcher(view))
+        return self.problem_of(view, self.matches(view))
 
     def stored_problem(self, query: str | None = None) -> Problem | None:
         """``problem`` at once where its matches are stored, else None. Its ``pictures`` may not be drawn yet."""
@@ -149,7 +162,7 @@ class MapScene:
         return tuple(by_path[path] for path in shown if path in by_path)
 
     def problem_of(self, view: View, matches: Matches) -> Problem:
-        """The problem of a query and the correspondences that ``matcher`` found for it.
+        """The problem of a query and the correspondences that were found for it.
 
         Gravity is the query's own if it is measured, else that of the most similar reference (Sec. III: a vehicle's
         roll and pitch are about those of the vehicle that mapped the place). Raises ``ProblemError`` for too few.
@@ -231,7 +244,9 @@ def _contradiction(stated: Gravity, nearby: Gravity | None) -> tuple[str, ...]:
 
 
 REQUIRED = {"kind", "name"}
+"""Keys that a scene of images of every kind must have."""
 OPTIONAL = {"about", "frontend", "gravity", "masks", "options", "thresholds", "units"}
+"""Keys that it may have."""
 OPTIONAL_EXAMPLE = """\
 about = "a line about it"
 units = "unknown"                      # the map has no scale; else lengths are metres
@@ -247,7 +262,7 @@ references = 4                         # how many of the most similar references
 [masks]                                # pixels that are left out
 nadir_deg = 25                         # degrees around the camera's own down
 """
-"""The keys that scenes of images of every kind may have, but for ``[gravity]``."""
+"""``OPTIONAL`` as part of a scene file, without ``[gravity]``, whose keys differ by kind."""
 UNITS: Mapping[str, bool] = {"metres": True, "unknown": False}
 """Values of ``units``, and whether lengths are metres then."""
 
@@ -256,6 +271,7 @@ UNITS: Mapping[str, bool] = {"metres": True, "unknown": False}
 class MapSettings:
     """The values of the keys that all kinds of map scenes share."""
 
+    kind: str
     name: str
     frontend: Mapping[str, Any]
     """The section [frontend], for ``image_matcher`` to check."""
@@ -312,6 +328,7 @@ class MapSettings:
             thresholds=self.thresholds,
             metric=self.metric,
             remarks=(*remarks, *said),
+            kind=self.kind,
             **others,
         )
 
@@ -338,6 +355,7 @@ def read_settings(
     among the known ones. Raises ``InputError`` for a wrong value.
     """
     return MapSettings(
+        kind=scene_file.text(table, "kind", where),
         name=scene_file.text(table, "name", where),
         frontend=scene_file.section(table, "frontend", where),
         gravity=read_gravity(scene_file.section(table, "gravity", where), where, gravity_bound_deg),

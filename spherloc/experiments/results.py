@@ -118,16 +118,14 @@ class QueryResult:
         return np.full(3, np.nan) if self.truth_cam_from_map is None else camera_centre(self.truth_cam_from_map)
 
 
-_FIELDS = tuple(item.name for item in fields(QueryResult))
+_TYPES = {item.name: item.type for item in fields(QueryResult)}
+_FIELDS = tuple(_TYPES)
 _POSES = ("cam_from_map", "truth_cam_from_map")
-_WHOLE = {"index", "references", "matches", "inliers"}
-_TEXTS = {"query", "status", "gravity_source", "diagnosis", "recording", "message", "inputs"}
-_NEEDED = {"index", "query", "status", "message", "remarks"}
-_LATER = {
-    *("gravity_source", "gravity_bound_deg", "gravity_error_deg"),
-    *("expected_rotation_error_deg", "expected_translation_error_m", "inputs"),
-}
-"""Fields that older files do not have."""
+_WHOLE = {name for name, kind in _TYPES.items() if kind in (int, int | None)}
+_TEXTS = {name for name, kind in _TYPES.items() if kind in (str, str | None)}
+_NEEDED = {item.name for item in fields(QueryResult) if item.default is not None}
+"""Fields of every line. The others may be null, or missing in files of versions that did not have them: both are
+None."""
 
 PLACE = ("x_m", "y_m", "z_m", "heading_deg")
 """Columns of the CSV that tell the estimated pose: the camera's position in the map's frame, metres or units of a map
@@ -172,15 +170,12 @@ def row_of_json(line: str, place: str) -> QueryResult:
         values = json.loads(line, parse_constant=lambda word: show(word))
     except (ValueError, RecursionError):
         values = None
-    if not isinstance(values, dict) or not set(_FIELDS) - _LATER <= set(values) <= set(_FIELDS):
+    if not isinstance(values, dict) or not _NEEDED <= set(values) <= set(_FIELDS):
         raise _damaged(place, "is not a result of a query")
-    for name in _LATER:
-        values.setdefault(name, None)
-    for name in _FIELDS:
-        if values[name] is None and name not in _NEEDED:
-            continue
-        values[name] = _value(name, values[name], place)
-    if (values["status"] in POSED) != (values["cam_from_map"] is not None) or values["status"] not in STATUSES:
+    for name, value in values.items():
+        if value is not None or name in _NEEDED:
+            values[name] = _value(name, value, place)
+    if (values["status"] in POSED) != (values.get("cam_from_map") is not None) or values["status"] not in STATUSES:
         raise _damaged(place, f"has the status {show(values['status'])}, which does not fit its pose")
     return QueryResult(**values)
 

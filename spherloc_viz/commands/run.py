@@ -154,7 +154,7 @@ def _problem(path: Path, scene: Scene, seed: int | None, query: str | None, vari
     view = changed.query(query)
     say(f"{path}: reading and matching images; what is new to this machine takes a while")
     prepare(changed)
-    matches = changed.matcher(view)
+    matches = changed.matches(view)
     for remark in matches.remarks:
         say(remark)
     problem = changed.problem_of(view, matches)

@@ -92,7 +92,7 @@ def session_pictures(results: Path, dataset: str, session: str) -> tuple[dict[st
         return {}, ""
     hardest = max(shares, key=lambda name: shares[name])
     view = scene.query(hardest)
-    matches = scene.matcher(view)
+    matches = scene.matches(view)
     problem = scene.problem_of(view, matches)
     shown = []
     for name in FIGURE_METHODS:

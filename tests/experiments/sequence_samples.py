@@ -26,7 +26,19 @@ STANDING = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 GRAVITY_MAP = np.array([0.0, 0.0, -1.0])
 
 KEYS = {"kind", "name"}
-OPTIONAL = {"queries", "broken", "few", "thin", "unknown", "wrong", "stuck", "registered", "timed", "folder"}
+OPTIONAL = {
+    "queries",
+    "broken",
+    "few",
+    "thin",
+    "unknown",
+    "wrong",
+    "stuck",
+    "registered",
+    "timed",
+    "folder",
+    "crashing",
+}
 
 
 def true_pose(place: int) -> np.ndarray:
@@ -40,7 +52,7 @@ def true_pose(place: int) -> np.ndarray:
 class DrawnMatches:
     """Draws the matches of a query: 60, 24 for ``thin`` queries, a single one for ``few``, wrong ones for ``wrong``.
 
-    ``stuck`` ones wait until there is a file "go on" beside the images.
+    ``stuck`` ones wait until there is a file "go on" beside the images; ``crashing`` ones raise what no loader may.
     """
 
     references: tuple[View, ...]
@@ -48,12 +60,15 @@ class DrawnMatches:
     thin: tuple[int, ...]
     wrong: tuple[int, ...]
     stuck: tuple[int, ...]
+    crashing: tuple[int, ...]
 
     def __call__(self, query: View) -> Matches:
         query.read()
         place = int(query.name[5:-4])
         while place in self.stuck and not query.path.with_name("go on").exists():
             time.sleep(0.01)
+        if place in self.crashing:
+            raise KeyError("depth")
         rng = np.random.default_rng(place)
         truth = true_pose(place)
         count = 1 if place in self.few else 24 if place in self.thin else 60
@@ -99,17 +114,18 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
         stamp = 1520530308.25 + 0.1 * place if table.get("timed", False) else None
         queries.append(View(image.name, CAMERA, image, known, Gravity(STANDING @ GRAVITY_MAP, "the IMU"), stamp))
     reference = View("reference", CAMERA, folder / "image0.png", true_pose(0))
-    few, thin, wrong = (tuple(table.get(name, ())) for name in ("few", "thin", "wrong"))
+    chosen = (tuple(table.get(name, ())) for name in ("few", "thin", "wrong", "stuck", "crashing"))
     return MapScene(
         name=table["name"],
         where=str(path),
         queries=tuple(queries),
         references=(reference,),
-        matcher=DrawnMatches((reference,), few, thin, wrong, tuple(table.get("stuck", ()))),
+        matcher=DrawnMatches((reference,), *chosen),
         gravity_map=GRAVITY_MAP,
         thresholds=((0.5, 0.1), (2.0, 0.5)),
         registration=DistanceRegistration() if table.get("registered", False) else None,
         remarks=("The loader skipped nothing of note.",) if table.get("timed", False) else (),
+        kind=table["kind"],
     )
 
 

@@ -19,7 +19,7 @@ KEYS: tuple[Callable[[RunRow], tuple[object, ...]], ...] = (
     lambda row: (row.problem_key, row.seed),
     lambda row: (row.problem_key,),
 )
-"""Keys by which two runs can be a pair; the first one by which most runs of the smaller set have a partner is used."""
+"""Keys by which two runs can be a pair; the one that gives most pairs is used, of several such the first."""
 MEASURED: Mapping[str, str] = {
     "rotation_error_deg": "rotation error, deg",
     "translation_error_m": "position error, {unit}",
