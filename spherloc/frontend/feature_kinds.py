@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +17,22 @@ from spherloc.types import ByteArray, FloatArray
 
 Descriptors = NDArray[np.float32 | np.uint8]
 
-SIFT_CONTRAST = 0.02
-"""COLMAP's threshold (its peak threshold is a third of it): half of OpenCV's, which finds little in dim rooms."""
+SIFT_CONTRAST, WEAK_SIFT_CONTRAST = 0.02, 0.007
+"""COLMAP's threshold (its peak threshold is a third of it), half of OpenCV's, which finds little in dim rooms; and that
+for images in which this one finds little, too, such as those of plain walls."""
 SMALLEST_PX = 16
 """OpenCV fails on images with a smaller side, in which there is nothing to find."""
+
+
+Run = Callable[[ByteArray, ByteArray, int, Path | None], tuple[FloatArray, Any]]
+"""``detect`` of one kind: image, mask, most features, weights -> keypoints (N, 5) and descriptors."""
 
 
 @dataclass(frozen=True)
 class Kind:
     """One kind of features."""
 
-    run: Callable[[ByteArray, ByteArray, int, Path | None], tuple[FloatArray, Any]]
-    """``detect`` of this kind: image, mask, most features, weights -> keypoints (N, 5) and descriptors."""
+    run: Run
     reach: float
     """Radius of the neighbourhood that the detector uses around a keypoint, as a share of the keypoint's size."""
     binary: bool = False
@@ -38,19 +43,24 @@ class Kind:
     """Whether the extra ``learned`` brings its weights, so that no file is needed."""
     most: int = 8000
     """Number of features that are kept, the strongest, unless the options give another."""
+    weak: Run | None = None
+    """Finds weaker ones, too; None if this kind has no threshold for that."""
 
 
 def detect(
-    method: str, image: ByteArray, mask: ByteArray, most: int, weights: Path | None
+    method: str, image: ByteArray, mask: ByteArray, most: int, weights: Path | None, weak: bool = False
 ) -> tuple[FloatArray, Descriptors]:
-    """Features of an image, (H, W) or (H, W, 3) BGR, at the non-zero pixels of ``mask`` (H, W).
+    """Features of an image, (H, W) or (H, W, 3) BGR, at the non-zero pixels of ``mask`` (H, W), with ``weak`` also
+    those that this kind otherwise leaves out.
 
     Returns keypoints (N, 5): pixel u, v with the first pixel's centre at (0.5, 0.5), size px, angle rad, score; and
     descriptors (N, D). There may be more than ``most`` features. Raises ``InputError`` if this OpenCV lacks the method
     or its weights cannot be used.
     """
     if min(mask.shape) >= SMALLEST_PX and mask.any():
-        keypoints, descriptors = KINDS[method].run(image, mask, most, weights)
+        kind = KINDS[method]
+        run = kind.weak if weak and kind.weak is not None else kind.run
+        keypoints, descriptors = run(image, mask, most, weights)
         if descriptors is not None and len(keypoints) > 0:
             return keypoints, descriptors
     return np.empty((0, 5)), np.empty((0, 1), np.uint8 if KINDS[method].binary else np.float32)
@@ -64,10 +74,12 @@ def keypoint_table(keypoints: Any, shift_px: float = 0.5) -> FloatArray:
     return table
 
 
-def _sift(image: ByteArray, mask: ByteArray, _most: int, _weights: Path | None) -> tuple[FloatArray, Any]:
+def _sift(
+    image: ByteArray, mask: ByteArray, _most: int, _weights: Path | None, contrast: float = SIFT_CONTRAST
+) -> tuple[FloatArray, Any]:
     # ``nfeatures`` is not used: OpenCV applies it before the mask, so that masked features would count too.
     # Without the precise upscale every keypoint lies a quarter of a pixel too far right and down.
-    sift = cv2.SIFT.create(contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(contrastThreshold=contrast, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(grey(image), mask)
     return keypoint_table(keypoints), None if descriptors is None else root_normalised(
         np.asarray(descriptors, np.float32)
@@ -125,7 +137,7 @@ def _aliked(image: ByteArray, mask: ByteArray, most: int, weights: Path | None) 
 
 KINDS = {
     # Two standard deviations of the Gaussian at which the keypoint was found: each detector defines size differently.
-    "sift": Kind(_sift, reach=1.0),
+    "sift": Kind(_sift, reach=1.0, weak=partial(_sift, contrast=WEAK_SIFT_CONTRAST)),
     "orb": Kind(_orb, reach=0.2, binary=True),
     "akaze": Kind(_akaze, reach=0.7, binary=True),
     "surf": Kind(_surf, reach=0.5),

@@ -3,7 +3,7 @@
 import io
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi, tau
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from spherloc.frontend.view import View
 from spherloc.images import MAX_BYTES
 from spherloc.types import BoolArray, ByteArray, FloatArray
 
-VERSION = 5
+VERSION = 6
 """Number to be increased when the same options give other features, so that old files are not used."""
 
 
@@ -80,6 +80,8 @@ JOINED_NUMBERS = 128
 """Most numbers of a descriptor of one of these kinds."""
 METHODS = (*KINDS, *JOINED)
 MAX_FEATURES = 50_000
+ENOUGH = 4000
+"""An image with fewer features gets weaker ones, too, up to this number."""
 RIM_PX = 4.0
 """Features this close to unusable pixels (large ones also farther away) show the rim of the image and not the scene."""
 MAX_PIXELS = 5_000_000
@@ -179,7 +181,10 @@ def extract(view: View, options: FeatureOptions | None = None) -> Features:
     found = fetch(path) if path else None
     if found is None:
         image, allowed = view.read(), usable.astype(np.uint8)
-        found = _on_faces(image, allowed, options, panorama) if panorama else _on_image(image, allowed, options)
+        found = _found(image, allowed, options, panorama)
+        few = replace(options, max_features=min(ENOUGH, options.most))
+        if len(found[0]) < few.most and KINDS[options.method].weak is not None:
+            found = _found(image, allowed, few, panorama, weak=True)
         if path:
             keep(path, *found)
     table, descriptors = found
@@ -209,7 +214,19 @@ def _joined(parts: Sequence[Features], method: str) -> Features:
     return Features(pixels, sizes, angles, scores, descriptors, method, parts[0].image_size, tuple(parts))
 
 
-def _on_image(image: ByteArray, usable: ByteArray, options: FeatureOptions) -> tuple[FloatArray, Descriptors]:
+def _found(
+    image: ByteArray, usable: ByteArray, options: FeatureOptions, panorama: Equirectangular | None, weak: bool = False
+) -> tuple[FloatArray, Descriptors]:
+    """Keypoints (N, 5) and descriptors of an image in its own pixels, the strongest first, with ``weak`` also those
+    that its kind otherwise leaves out."""
+    if panorama is None:
+        return _on_image(image, usable, options, weak)
+    return _on_faces(image, usable, options, panorama, weak)
+
+
+def _on_image(
+    image: ByteArray, usable: ByteArray, options: FeatureOptions, weak: bool
+) -> tuple[FloatArray, Descriptors]:
     """Keypoints (N, 5) and descriptors of an image in its own pixels, the strongest first."""
     height, width = image.shape[:2]
     shrink = min(1.0, (MAX_PIXELS / (width * height)) ** 0.5)
@@ -218,13 +235,13 @@ def _on_image(image: ByteArray, usable: ByteArray, options: FeatureOptions) -> t
         image = np.asarray(cv2.resize(image, small, interpolation=cv2.INTER_AREA), np.uint8)
         usable = np.asarray(cv2.resize(usable, small, interpolation=cv2.INTER_NEAREST), np.uint8)
     rows, columns = usable.shape
-    table, descriptors = _detected(image, usable, np.ones(usable.shape, bool), options)
+    table, descriptors = _detected(image, usable, np.ones(usable.shape, bool), options, weak)
     table[:, :3] *= width / columns, height / rows, width / columns
     return _strongest(table, descriptors, options)
 
 
 def _on_faces(
-    image: ByteArray, usable: ByteArray, options: FeatureOptions, panorama: Equirectangular
+    image: ByteArray, usable: ByteArray, options: FeatureOptions, panorama: Equirectangular, weak: bool
 ) -> tuple[FloatArray, Descriptors]:
     """Keypoints (N, 5) and descriptors of a panorama in its own pixels, the strongest first.
 
@@ -233,7 +250,7 @@ def _on_faces(
     faces = panorama_faces(panorama, FACE_SHARPNESS, MAX_FACE_PIXELS)
     tables, parts = [], []
     for face in range(len(faces)):
-        table, descriptors = _detected(*faces.cut(face, image, usable), options)
+        table, descriptors = _detected(*faces.cut(face, image, usable), options, weak)
         tables.append(_on_panorama(table, faces, face))
         parts.append(descriptors)
     table = np.concatenate(tables)
@@ -276,13 +293,13 @@ def _on_panorama(table: FloatArray, faces: Faces, face: int) -> FloatArray:
 
 
 def _detected(
-    image: ByteArray, usable: ByteArray, wanted: BoolArray, options: FeatureOptions
+    image: ByteArray, usable: ByteArray, wanted: BoolArray, options: FeatureOptions, weak: bool
 ) -> tuple[FloatArray, Descriptors]:
     """Keypoints (N, 5) and descriptors of a flat image, with masks (H, W) of the usable and of the wanted pixels."""
     kind = KINDS[options.method]
     room = _room_px(usable)
     mask = (wanted & (room > RIM_PX)).astype(np.uint8)
-    table, descriptors = detect(options.method, image, mask, options.most, options.weights)
+    table, descriptors = detect(options.method, image, mask, options.most, options.weights, weak)
     kept = _usable_rows(table, descriptors, np.where(wanted, room, np.float32(0.0)), kind.reach)
     return table[kept], descriptors[kept]
 

@@ -286,8 +286,8 @@ def map(
     Args:
         folder: Folder of the photographs, of a folder for each camera, or a sequence in the layout of EuRoC or TUM-VI
             (mav0), whose IMU and ground truth are used; with --video, where its frames are put.
-        camera: Calibration file; without it, those beside the images are taken, full panoramas need none, and
-            matches between the rest tell their lens.
+        camera: Calibration file, or a folder of them that are called as the cameras or as the images; without it, those
+            beside the images are taken, full panoramas need none, and matches between the rest tell their lens.
         camera_name: Which camera of that file all images have; otherwise their name or their folder's says it.
         panorama: Images of about 2 to 1 are panoramas of the whole sphere, whatever they show or lies beside them.
         video: Take frames from this video first, the sharpest of each stretch.
@@ -341,7 +341,7 @@ def map(
     measured = ScaleMeasurement(camera_height, apart)
     if camera is None and camera_name is not None:
         raise InputError(f"--camera-name {shlex.quote(camera_name)} goes with --camera FILE; give that file too.")
-    if camera is not None:
+    if camera is not None and not is_folder(camera):
         camera_names(camera)  # before frames are taken from a video
     made = make(
         folder,

@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 
 from spherloc.errors import InputError
 from spherloc.frontend import features as module
-from spherloc.frontend.features import FeatureOptions, extract
+from spherloc.frontend.feature_kinds import SIFT_CONTRAST, WEAK_SIFT_CONTRAST
+from spherloc.frontend.features import ENOUGH, FeatureOptions, extract
 from spherloc.frontend.matching import match
 from tests.frontend.pictures import blobs, disc, fisheye, fisheye_of, texture, view_of
 
@@ -43,13 +44,26 @@ def test_sift_lies_at_the_centre_of_a_blob(tmp_path, rng, sigma_px):
     assert np.allclose(found.sizes_px[index], 2 * sigma_px, rtol=0.25)
 
 
+def test_an_image_with_few_features_gets_weaker_ones(tmp_path, rng):
+    """Up to as many as are enough; one that has those keeps its own alone."""
+    sift = cv2.SIFT_create(contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
+    plain = (100 + 0.25 * (texture(rng, 200, 300).astype(float) - 128)).astype(np.uint8)
+    few, found = len(sift.detect(plain, None)), extract(view_of(tmp_path, plain, fisheye_of(300, 200)))
+    assert len(found) > 2 * few > 0 and np.all(np.diff(found.scores) <= 0.0)
+    rich = texture(rng, 600, 900)
+    many = len(sift.detect(rich, None))
+    ours = extract(view_of(tmp_path, rich, fisheye_of(900, 600)))
+    assert ENOUGH < len(ours) == many
+    assert len(extract(view_of(tmp_path, plain, fisheye_of(300, 200)), FeatureOptions(max_features=few))) == few
+
+
 def test_descriptors_of_sift_are_root_normalised(tmp_path, rng):
     """Unit vectors whose squares are the L1-normalised descriptors that OpenCV gives."""
     image = texture(rng, 200, 300)
     found = extract(view_of(tmp_path, image, fisheye_of(300, 200)))
     assert len(found) > 50 and found.descriptors.dtype == np.float32
     assert np.allclose(np.linalg.norm(found.descriptors, axis=1), 1.0, atol=1e-5)
-    sift = cv2.SIFT_create(contrastThreshold=0.02, enable_precise_upscale=True)
+    sift = cv2.SIFT_create(contrastThreshold=WEAK_SIFT_CONTRAST, enable_precise_upscale=True)
     keypoints, raw = sift.detectAndCompute(image, None)
     places = np.array([(*one.pt, one.size, np.radians(one.angle)) for one in keypoints])
     ours = np.column_stack([found.pixels - 0.5, found.sizes_px, found.angles_rad])

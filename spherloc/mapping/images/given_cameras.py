@@ -1,7 +1,7 @@
 """The cameras of a calibration file that a user gives for photographs of known sizes."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from spherloc.cameras.base import Camera
@@ -11,18 +11,46 @@ from spherloc.cameras.scaling import scaled
 from spherloc.errors import CalibrationError, InputError, show
 from spherloc.files import is_folder, is_image, names_in
 from spherloc.images import read_size
+from spherloc.mapping.images.found_calibrations import calibration_files
+from spherloc.mapping.images.left_out import MAX_NAMED, some_of
 
 Size = tuple[int, int]
 """Width and height, px."""
 
 
-def given_cameras(file: Path, name: str | None, folder: Path) -> tuple[dict[str, Camera], list[str]]:
-    """The cameras of a calibration file by name, or the named one alone, for photographs in ``folder``, and remarks.
+def given_cameras(place: Path, name: str | None, folder: Path) -> tuple[dict[str, Camera], list[str]]:
+    """The cameras of a calibration file, or of the files in a folder, by name, or the named one alone, for photographs
+    in ``folder``, and remarks. A file in a folder that has one camera gives its name to that.
 
     If none has the size of a photograph, those of the same shape are scaled to the most frequent size. If a file states
-    no size, and the photographs have one, it is that. Raises ``CalibrationError`` for a file that cannot be used.
+    no size, and the photographs have one, it is that. Raises ``CalibrationError`` for a file that cannot be used and
+    for a folder without one that can.
     """
-    sizes = _sizes_in(folder)
+    images = list(_images_in(folder))
+    sizes = _sizes_of(images)
+    if not is_folder(place):
+        return _of_file(place, name, sizes)
+    cameras, remarks = dict[str, Camera](), list[str]()
+    for file in calibration_files(place, [path.name for path in images]):
+        try:
+            found, about = _of_file(file, None, sizes)
+        except CalibrationError as error:
+            remarks.append(f"It is not used: {error}")
+            continue
+        cameras |= {one or file.stem: camera for one, camera in found.items()}
+        remarks += about
+    if not cameras:
+        raise CalibrationError(
+            f"{place}: none of its files can be read as a calibration; give a folder of calibrations, called as the "
+            f"cameras or as the images are, or one file. {' '.join(remarks[:1])}".rstrip()
+        )
+    if name is not None and name not in cameras:
+        raise CalibrationError(f"{place}: has no camera {show(name)}; choose one of {some_of(tuple(cameras))}.")
+    return cameras if name is None else {name: cameras[name]}, remarks[:MAX_NAMED]
+
+
+def _of_file(file: Path, name: str | None, sizes: Counter[Size]) -> tuple[dict[str, Camera], list[str]]:
+    """``given_cameras`` of a file, for photographs of ``sizes``."""
     names: Sequence[str | None] = [name] if name is not None else camera_names(file)
     cameras, remarks = dict[str, Camera](), list[str]()
     for one in names or (None,):
@@ -57,15 +85,19 @@ def _scaled(file: Path, cameras: Mapping[str, Camera], size: Size) -> tuple[dict
     return found, remarks
 
 
-def _sizes_in(folder: Path) -> Counter[Size]:
-    """How many images of each size there are in a folder or, if there are none, in the folders in it."""
+def _images_in(folder: Path) -> Iterator[Path]:
+    """The images in a folder or, if there are none, in the folders in it."""
     names = names_in(folder) if is_folder(folder) else []
     paths = [folder / name for name in names if is_image(name)]
-    if not paths:
-        inside = [folder / name for name in names if is_folder(folder / name)]
-        paths = [place / name for place in inside for name in names_in(place) if is_image(name)]
+    inside = [] if paths else [folder / name for name in names if is_folder(folder / name)]
+    yield from paths
+    yield from (place / name for place in inside for name in names_in(place) if is_image(name))
+
+
+def _sizes_of(images: Sequence[Path]) -> Counter[Size]:
+    """How many images of each size there are."""
     sizes = Counter[Size]()
-    for path in paths:
+    for path in images:
         try:
             sizes[read_size(path)] += 1
         except InputError:  # told later, with all that is left out
