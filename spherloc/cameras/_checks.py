@@ -18,6 +18,10 @@ MAX_SIDE_PX = 100_000
 C = TypeVar("C")
 
 
+class UnrecognisedError(CalibrationError):
+    """The file is of a kind that spherloc does not read; an extension may read it."""
+
+
 def whole_pixels(key: str, value: Any) -> int:
     """An image side in pixels; raises ``CalibrationError`` if it is not a whole number from 1 to ``MAX_SIDE_PX``."""
     side = int(value) if isinstance(value, Integral) and not isinstance(value, bool) else 0
@@ -81,7 +85,8 @@ def located(place: str) -> Iterator[None]:
     try:
         yield
     except CalibrationError as error:
-        raise CalibrationError(f"{place}: {error}") from None
+        kind = UnrecognisedError if isinstance(error, UnrecognisedError) else CalibrationError
+        raise kind(f"{place}: {error}") from None
 
 
 def camera_to_table(camera: Any) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import yaml
 
-from spherloc.cameras._checks import coefficients, finite, located
+from spherloc.cameras._checks import UnrecognisedError, coefficients, finite, located
 from spherloc.errors import MAX_REASON, CalibrationError, InputError, reason, shorten, show
 from spherloc.files import is_file, is_image, names_in, read_file
 
@@ -29,10 +29,6 @@ KNOWN = (
     "WoodScape or nerfstudio, COLMAP's cameras.txt, kapture's sensors.txt, an OCamCalib text or a TOML with a [camera] "
     "table (docs/conventions.md has its keys)"
 )
-
-
-class UnrecognisedError(CalibrationError):
-    """The file is of a kind that spherloc itself does not read; an extension may read it."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -65,7 +61,7 @@ def read_text(path: Path) -> str:
     except IsADirectoryError:
         raise CalibrationError(f"is a folder: give the calibration file itself{_such_as(path)}.") from None
     except OSError as error:
-        raise CalibrationError(f"cannot be read ({reason(error)}): check the path and its permissions.") from None
+        raise UnrecognisedError(f"cannot be read ({reason(error)}): check the path and its permissions.") from None
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

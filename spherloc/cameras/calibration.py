@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from spherloc.cameras import json_files, ocam_files, tool_files
-from spherloc.cameras._checks import located
+from spherloc.cameras._checks import UnrecognisedError, located
 from spherloc.cameras._files import (
     KNOWN,
-    UnrecognisedError,
     parse_json,
     parse_opencv_xml,
     parse_yaml,

@@ -10,7 +10,15 @@ from typing import Any, cast
 import numpy as np
 
 from spherloc import registry
-from spherloc.cameras._checks import camera_from_keys, camera_to_table, finite, positive, rows, whole_pixels
+from spherloc.cameras._checks import (
+    UnrecognisedError,
+    camera_from_keys,
+    camera_to_table,
+    finite,
+    positive,
+    rows,
+    whole_pixels,
+)
 from spherloc.cameras.base import Camera
 from spherloc.errors import CalibrationError, InputError, SpherlocError, show
 
@@ -93,7 +101,7 @@ def read_by_extensions(path: Path, name: str | None, unknown: str) -> Camera:
     """The camera that the first of the registered readers, in alphabetical order, finds in a file.
 
     Raises ``CalibrationError``, without the file's name: the text ``unknown``, which says that spherloc does not know
-    the kind of file, and the reasons of readers that refused it.
+    the kind of file, and the reasons of readers that refused it; ``UnrecognisedError`` if none did.
     """
     refusals: list[str] = []
     for key in registry.names("calibrations"):
@@ -110,7 +118,8 @@ def read_by_extensions(path: Path, name: str | None, unknown: str) -> Camera:
             refusals.append(f"{what} refuses it ({_clause(error)})")
         except SpherlocError as error:
             refusals.append(_clause(error))
-    raise CalibrationError("; ".join([_clause(unknown), *refusals]) + ".")
+    kind = CalibrationError if refusals else UnrecognisedError
+    raise kind("; ".join([_clause(unknown), *refusals]) + ".")
 
 
 def _clause(sentence: object) -> str:

@@ -11,7 +11,7 @@ from spherloc.cameras.eucm import Eucm
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.cameras.scaling import scaled
-from spherloc.errors import CalibrationError
+from spherloc.errors import CalibrationError, InputError
 from spherloc.mapping.images.given_cameras import given_cameras
 from spherloc.mapping.images.photographs import photographs as find_photographs
 
@@ -98,3 +98,16 @@ def test_what_four_coefficients_are_taken_for_is_told(photographs):
     found = find_photographs(photographs, {})
     assert found.remarks[0] == "The calibration found beside them: front."
     assert found.remarks[1].startswith("front: its four coefficients are taken for those of a fisheye")
+
+
+def test_a_calibration_beside_photographs_that_leaves_a_question_is_told(photographs):
+    """Whatever the file is called; files that are no calibrations are not."""
+    text = "camera_matrix: [[186, 0, 330], [0, 186, 238], [0, 0, 1]]\ndist_coeffs: [-0.04, -0.001, -0.005, 0.001]\n"
+    (photographs / "front.yaml").write_text(f"{text}resolution: [640, 480]\n")
+    (photographs / "notes.json").write_text("{}")
+    (photographs / "labels.json").write_text(f'{{"shapes": "{"x" * 300_000}"}}')
+    with pytest.raises(InputError) as caught:
+        find_photographs(photographs, {})
+    told = str(caught.value)
+    assert "the four dist_coeffs may be those of a fisheye or of a pinhole: add distortion_model" in told
+    assert "notes" not in told and "labels" not in told

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from spherloc.cameras._checks import UnrecognisedError
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import about_calibration, camera_names, load_camera
 from spherloc.errors import SpherlocError, shorten
@@ -36,7 +37,7 @@ class FoundCalibrations:
     cameras: Mapping[str, Camera]
     """By the name of the file or, if it has several, of the camera in it."""
     refused: tuple[str, ...] = ()
-    """Why files are not read that are called as calibrations are, a sentence each."""
+    """Why files are not read that are calibrations or are called so, a sentence each."""
     concluded: Mapping[str, str] = field(default_factory=dict)
     """What files do not say of their lens and was concluded, a sentence each, by the name of the file."""
     of_image: Mapping[str, Camera] = field(default_factory=dict)
@@ -147,7 +148,7 @@ def calibrations_of(files: Sequence[Path], least: int = 1) -> FoundCalibrations:
                 found[path.stem] = load_camera(path)
                 if about := about_calibration(path):
                     concluded[path.stem] = about
-        except SpherlocError as error:  # not a calibration, but for its name
-            if CALLED_CALIBRATION.search(path.stem.lower()):
+        except SpherlocError as error:  # perhaps not a calibration, but for its name
+            if CALLED_CALIBRATION.search(path.stem.lower()) or not isinstance(error, UnrecognisedError):
                 refused.append(f"A file beside them is not used: {error}")
     return FoundCalibrations(found, tuple(refused), concluded)
