@@ -49,7 +49,7 @@ def test_an_image_with_few_features_gets_weaker_ones(tmp_path, rng):
     sift = cv2.SIFT_create(contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
     plain = (100 + 0.25 * (texture(rng, 200, 300).astype(float) - 128)).astype(np.uint8)
     few, found = len(sift.detect(plain, None)), extract(view_of(tmp_path, plain, fisheye_of(300, 200)))
-    assert len(found) > 2 * few > 0 and np.all(np.diff(found.scores) <= 0.0)
+    assert len(found) > 1.5 * few > 0 and np.all(np.diff(found.scores) <= 0.0)
     rich = texture(rng, 600, 900)
     many = len(sift.detect(rich, None))
     ours = extract(view_of(tmp_path, rich, fisheye_of(900, 600)))
