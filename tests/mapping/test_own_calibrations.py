@@ -9,9 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from spherloc.cameras import calibration
 from spherloc.cameras.kannala_brandt import KannalaBrandt
+from spherloc.errors import CalibrationError
 from spherloc.mapping.alignment.rig_scale import fixed_images
 from spherloc.mapping.images import found_calibrations
 from spherloc.mapping.images.found_calibrations import calibrations_in, own_files
+from spherloc.mapping.images.given_cameras import given_cameras
 from spherloc.mapping.images.photographs import photographs
 from spherloc.mapping.rig import shots_of
 
@@ -73,6 +75,30 @@ def test_each_image_has_its_own_calibration(car, layout):
     first, second = (fixed.body_from_camera[f"00000_{name}.png"] for name in ("FV", "RV"))
     np.testing.assert_allclose(first[:3, 3] - second[:3, 3], [4.2, 0.0, 0.0])
     np.testing.assert_allclose(first[:3, 2], -second[:3, 2], atol=1e-12)  # they look ahead and back
+
+
+def test_a_folder_of_calibrations_is_given(car, tmp_path):
+    """Of such as are called as the images, and of such as are called as the cameras."""
+    folder = car("elsewhere", FV=85.0, RV=86.0, MVL=87.0, MVR=88.0)
+    (tmp_path / "elsewhere" / "labels.json").write_text("{}")
+    by_camera = tmp_path / "by camera"
+    by_camera.mkdir()
+    for name in CAMERAS:
+        (by_camera / f"{name}.json").write_text(json.dumps(as_woodscape(name)))
+    (by_camera / "calibration.yaml").write_text("nothing")
+    for given, told in ((tmp_path / "elsewhere", 0), (by_camera, 1)):
+        cameras, remarks = given_cameras(given, None, folder)
+        assert len(remarks) == told and all("calibration.yaml" in remark for remark in remarks)
+        views = photographs(folder, cameras).views
+        assert len(views) == TIMES * len(CAMERAS) and all(view.camera.model == "kannala_brandt" for view in views)
+        fixed, _ = fixed_images(folder, views, given)
+        assert fixed is not None and len(fixed.body_from_camera) == len(views)
+        assert len({view.camera.fx for view in views}) == (1 if told else 4)
+    assert list(given_cameras(by_camera, "RV", folder)[0]) == ["RV"]
+    with pytest.raises(CalibrationError, match=r"has no camera 'LV'; choose one of FV, MVL, MVR"):
+        given_cameras(by_camera, "LV", folder)
+    with pytest.raises(CalibrationError, match=r"rgb_images: none of its files can be read as a calibration; give a"):
+        given_cameras(folder, None, folder)
 
 
 def test_a_folder_of_the_folder_of_images(car):

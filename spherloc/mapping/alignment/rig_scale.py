@@ -26,7 +26,7 @@ from spherloc.cameras.scaling import scaled
 from spherloc.datasets.asl_layout import asl_sequence, camera_of_folder
 from spherloc.datasets.query_gravity import time_of
 from spherloc.errors import CalibrationError, InputError, shorten
-from spherloc.files import names_in
+from spherloc.files import is_folder
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
 from spherloc.mapping.advice import advice
@@ -34,9 +34,8 @@ from spherloc.mapping.alignment.positions import MAX_SCALE_SD, NEAR_SD
 from spherloc.mapping.alignment.sequence import shots_of_sequence
 from spherloc.mapping.alignment.upright import MapScale
 from spherloc.mapping.images.found_calibrations import (
-    CALIBRATIONS,
     CALLED_CALIBRATION,
-    MAX_CALIBRATIONS,
+    calibration_files,
     own_files,
 )
 from spherloc.mapping.images.lens import for_colmap
@@ -77,14 +76,14 @@ class FixedImages:
     not known which these are."""
 
 
-def fixed_images(folder: Path, views: Sequence[View], file: Path | None) -> tuple[FixedImages | None, list[str]]:
+def fixed_images(folder: Path, views: Sequence[View], given: Path | None) -> tuple[FixedImages | None, list[str]]:
     """How the cameras of ``views``, photographs in ``folder``, are fixed to each other, None if no calibration says it
     or if the images are of one camera; and remarks on what cannot be used.
 
-    The calibration is ``file``, else that of a sequence in the ASL layout, else one of each image, else a file in
-    ``folder``.
+    The calibration is ``given``, a file or a folder of them, else that of a sequence in the ASL layout, else one of
+    each image, else a file in ``folder``.
     """
-    sequence = None if file is not None else asl_sequence(folder)
+    sequence = None if given is not None else asl_sequence(folder)
     if sequence is not None:
         placed, files = {}, set[str]()
         for shot in shots_of_sequence(sequence, views):
@@ -92,13 +91,13 @@ def fixed_images(folder: Path, views: Sequence[View], file: Path | None) -> tupl
                 placed[shot.name] = (shot.camera, shot.calibrated.body_from_camera)
                 files.add(sequence.called(shot.calibrated.file))
         return _together(views, placed, " and ".join(sorted(files))), []
-    placed, remarks = _placed_by_own_files(views) if file is None else ({}, [])
+    file = given if given is not None and not is_folder(given) else None
+    placed, remarks = _placed_by_own_files(views, given) if file is None else ({}, [])
     if placed:
         several = len({camera for camera, _ in placed.values()}) > 1
         return _together(views, placed, "the calibration of each image") if several else None, remarks
-    names = [] if file is not None else [name for name in names_in(folder) if Path(name).suffix.lower() in CALIBRATIONS]
     alone: dict[str, FloatArray] = {}  # of files with one camera, by their names, fixed to the same body
-    for path in [folder / name for name in names[:MAX_CALIBRATIONS]] if file is None else [file]:
+    for path in calibration_files(given or folder, ()) if file is None else [file]:
         try:
             rig = read_rig(path)
         except CalibrationError as error:  # beside the photographs may lie anything
@@ -119,16 +118,18 @@ def fixed_images(folder: Path, views: Sequence[View], file: Path | None) -> tupl
     return None, remarks
 
 
-def _placed_by_own_files(views: Sequence[View]) -> tuple[dict[str, tuple[str, FloatArray]], list[str]]:
-    """The camera's name and ``body_from_camera`` (4, 4) of the images whose own calibrations say it, and the first
-    remark on those that cannot be used."""
+def _placed_by_own_files(
+    views: Sequence[View], given: Path | None
+) -> tuple[dict[str, tuple[str, FloatArray]], list[str]]:
+    """The camera's name and ``body_from_camera`` (4, 4) of the images whose own calibrations say it, in the folder
+    ``given`` if there is one, and the first remark on those that cannot be used."""
     folders: dict[Path, dict[str, str]] = {}
     for view in views:
         folders.setdefault(view.path.parent, {})[view.path.name] = view.name
     placed: dict[str, tuple[str, FloatArray]] = {}
     remarks: list[str] = []
     for folder, names in folders.items():
-        for image, path in own_files(folder, list(names)).items():
+        for image, path in own_files(folder, list(names), given).items():
             try:
                 rig = read_rig(path).body_from_camera
             except CalibrationError as error:

@@ -77,13 +77,22 @@ def calibrations_in(root: Path, inside: str = "", images: Sequence[str] = ()) ->
     return FoundCalibrations(cameras, found.refused, concluded, own.of_image, own.refused)
 
 
-def own_files(folder: Path, images: Sequence[str]) -> dict[str, Path]:
+def calibration_files(folder: Path, images: Sequence[str]) -> list[Path]:
+    """The calibration files in a folder of them: those that are called as ``images`` are or, without any, the first."""
+    stems = {Path(name).stem for name in images}
+    files = [folder / name for name in names_in(folder) if Path(name).suffix.lower() in CALIBRATIONS]
+    return [path for path in files if path.stem in stems] or files[:MAX_CALIBRATIONS]
+
+
+def own_files(folder: Path, images: Sequence[str], given: Path | None = None) -> dict[str, Path]:
     """The calibration file of each image, by its name, of those that have one: it is called as the image is but for the
-    ending, and lies beside it or in a folder of calibrations in or beside the folder of the images."""
+    ending, and lies in the folder ``given``, else beside it or in a folder of calibrations in or beside its
+    ``folder``."""
     wanted = {Path(name).stem: name for name in images}
     here = folder if folder.name else folder.resolve()
     found: dict[str, Path] = {}
-    for place in (folder, *(folder / name for name in OWN_FOLDERS), *(here.parent / name for name in OWN_FOLDERS)):
+    usual = (folder, *(folder / name for name in OWN_FOLDERS), *(here.parent / name for name in OWN_FOLDERS))
+    for place in usual if given is None else (given,):
         for name in names_in(place) if is_folder(place) else ():
             path = place / name
             image = wanted.get(path.stem) if path.suffix.lower() in OWN_ENDINGS else None
