@@ -20,7 +20,7 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.scene_file import load_scene
 from spherloc.estimators import options_type
 from spherloc.experiments.results import DOUBTFUL, LOCALIZED, QueryResult
-from spherloc.experiments.sequence import How, localize
+from spherloc.experiments.sequence import How, localize_queries
 from spherloc.mapping.scenes.joint_outcome import judged_together
 
 ROWS = (
@@ -88,7 +88,7 @@ def main() -> None:
         world, seed, part = (*one.split(":"), WHOLE)[:3]
         with TemporaryDirectory() as place:
             scene = scene_of(world, int(seed), part, Path(place) / "images")
-            before = {row.query: row for row, _ in localize(scene, scene.queries, *how[:3])}
+            before = {row.query: row for row, _ in localize_queries(scene, scene.queries, *how[:3])}
             after = before | {row.query: row for row, _ in judged_together(scene, tuple(before.values()), how)}
         print(f"| {one} | {cells(before.values())} | {cells(after.values())} |", flush=True)
 

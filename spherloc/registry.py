@@ -1,4 +1,4 @@
-"""Finds cameras, calibration readers, solvers, estimators, dataset loaders and layers by entry point.
+"""Finds cameras, calibration readers, solvers, estimators, dataset loaders, layers and lessons by entry point.
 
 To add one takes one file and one line. What another package registers is an extension (docs/extending.md). An extension
 that cannot be imported or fails does not affect others: where it is used, one sentence names it.

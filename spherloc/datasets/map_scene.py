@@ -244,7 +244,9 @@ def _contradiction(stated: Gravity, nearby: Gravity | None) -> tuple[str, ...]:
 
 
 REQUIRED = {"kind", "name"}
+"""Keys that a scene of images of every kind must have."""
 OPTIONAL = {"about", "frontend", "gravity", "masks", "options", "thresholds", "units"}
+"""Keys that it may have."""
 OPTIONAL_EXAMPLE = """\
 about = "a line about it"
 units = "unknown"                      # the map has no scale; else lengths are metres
@@ -260,7 +262,7 @@ references = 4                         # how many of the most similar references
 [masks]                                # pixels that are left out
 nadir_deg = 25                         # degrees around the camera's own down
 """
-"""The keys that scenes of images of every kind may have, but for ``[gravity]``."""
+"""``OPTIONAL`` as part of a scene file, without ``[gravity]``, whose keys differ by kind."""
 UNITS: Mapping[str, bool] = {"metres": True, "unknown": False}
 """Values of ``units``, and whether lengths are metres then."""
 

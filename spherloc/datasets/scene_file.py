@@ -26,8 +26,8 @@ BUNDLED = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).resolve().parent
 """Folder of the bundled scenes: inside this package in an installation, beside the packages in a checkout."""
 
 
-_KINDS: dict[type, str] = {}
-"""The kinds of extensions by the classes of the scenes that their loaders gave."""
+_EXTENSION_KINDS: dict[type, str] = {}
+"""Names of kinds that extensions registered, by the class of the scenes that their loaders gave."""
 
 
 class Scene(Protocol):
@@ -64,7 +64,7 @@ def load_scene(path: str | Path) -> Scene:
                 f"{path}: {registry.title('datasets', kind)} gave {show(scene)}, which has no name or no problem(); "
                 "tell its authors."
             )
-        _KINDS.setdefault(type(scene), kind)
+        _EXTENSION_KINDS.setdefault(type(scene), kind)
     return scene
 
 
@@ -76,12 +76,12 @@ def loader_of(kind: str) -> Any:
     return load
 
 
-def drawn(scene: Scene, problem: Callable[[], Any]) -> Problem:
-    """The result of ``problem``, a call of the scene's method; it is checked if the scene is an extension's.
+def checked_problem(scene: Scene, problem: Callable[[], Any]) -> Problem:
+    """The result of ``problem``, a call of the scene's method; it is checked if an extension has the scene's class.
 
     Raises ``InputError`` for whatever an extension's scene raises, and if its result is not a ``Problem``.
     """
-    kind = _KINDS.get(type(scene))
+    kind = _EXTENSION_KINDS.get(type(scene))
     if kind is None or type(scene).__module__.startswith("spherloc."):
         return problem()
     with registry.guarded("datasets", kind, scene.name):

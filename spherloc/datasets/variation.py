@@ -12,7 +12,7 @@ from spherloc.cameras.base import Camera, model_name
 from spherloc.cameras.calibration import load_camera
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.point_cloud import OUTLIER_KINDS, Lens, OutlierKind
-from spherloc.datasets.scene_file import Scene, drawn
+from spherloc.datasets.scene_file import Scene, checked_problem
 from spherloc.datasets.synthetic import SyntheticScene, TrueCamera
 from spherloc.errors import InputError, show
 from spherloc.geometry import transform
@@ -109,10 +109,10 @@ class Variation:
         """``problem`` with all matches as they are; raises ``InputError`` as it does."""
         changed = self.scene(scene)
         if isinstance(changed, MapScene):
-            return drawn(changed, lambda: changed.problem(seed, query))
+            return checked_problem(changed, lambda: changed.problem(seed, query))
         if query is not None:
             raise InputError(f"{scene.name}: has no query images to choose from; leave out the query.")
-        return drawn(changed, lambda: changed.problem(seed))
+        return checked_problem(changed, lambda: changed.problem(seed))
 
     def scene(self, scene: Scene) -> Scene:
         """The scene with its simulation changed; raises ``InputError`` if it has none."""

@@ -69,7 +69,7 @@ class How(NamedTuple):
     that ``estimator`` does not localize (Sec. VI-C); None leaves all queries to ``estimator``."""
 
 
-def localize(
+def localize_queries(
     scene: MapScene, queries: Iterable[View], estimator: str, options: Any, seed: int
 ) -> Iterator[tuple[QueryResult, Trace | None]]:
     """Match and solve queries of the scene in their order; ``options`` is the estimator's dataclass.
@@ -85,7 +85,7 @@ def localize(
 def localize_by_each(
     scene: MapScene, queries: Iterable[tuple[View, Sequence[int]]], hows: Sequence[How]
 ) -> Iterator[tuple[int, QueryResult, Trace | None]]:
-    """Like ``localize``, but each query is matched once and solved by several estimators.
+    """Like ``localize_queries``, but each query is matched once and solved by several estimators.
 
     Each query comes with the indices of the ``hows`` that are to solve it, each result with the index of its own.
     """

@@ -13,7 +13,7 @@ from spherloc.diagnosis import Cause, diagnose
 from spherloc.errors import InputError, ProblemError
 from spherloc.estimators import default_options
 from spherloc.experiments.results import LOCALIZED, QueryResult, json_line, row_of_json
-from spherloc.experiments.sequence import localize
+from spherloc.experiments.sequence import localize_queries
 from spherloc.frontend.gravity_from_lines import NOT_FOUND
 from spherloc.frontend.view import Gravity, Matches, View
 from spherloc.geometry import DOWN
@@ -169,7 +169,7 @@ def test_a_problem_has_the_bound_and_the_source_of_its_own_query(tmp_path, probl
         assert (found.gravity_bound_rad, found.gravity_sd_rad, found.gravity_source) == expected
         assert found.aligned.gravity_bound_rad == expected[0]
         assert found.gravity_error_rad == pytest.approx(0.0, abs=1e-7)
-        row, _ = next(iter(localize(scene, scene.queries, "mc", default_options("mc", found), 0)))
+        row, _ = next(iter(localize_queries(scene, scene.queries, "mc", default_options("mc", found), 0)))
         assert row.gravity_source == expected[2] and row.gravity_bound_deg == pytest.approx(np.degrees(expected[0]))
         assert row_of_json(json_line(row), "here").gravity_source == expected[2]
 
@@ -249,7 +249,7 @@ def test_a_source_is_a_short_text(problem):
 def test_runs_and_sequences_say_where_gravity_came_from(tmp_path, problem):
     view = View("query", problem.camera, tmp_path / "q.png", gravity=Gravity(problem.gravity_camera, "the IMU", 0.01))
     scene = small_scene(tmp_path, problem, view)
-    row, trace = next(iter(localize(scene, scene.queries, "mc", default_options("mc", scene.problem()), 0)))
+    row, trace = next(iter(localize_queries(scene, scene.queries, "mc", default_options("mc", scene.problem()), 0)))
     assert trace is not None
     told = as_text(tmp_path / "s.toml", trace, diagnose(trace), None)
     assert "  gravity from the IMU, within 0.57 deg; 0 deg off the truth\n" in told

@@ -27,7 +27,7 @@ from spherloc.datasets.map_scene import OPTIONAL, OPTIONAL_EXAMPLE, MapScene
 from spherloc.errors import SpherlocError
 from spherloc.experiments import read_results
 from spherloc.experiments.kept_results import kept_results
-from spherloc.experiments.sequence import inputs_of, localize
+from spherloc.experiments.sequence import inputs_of, localize_queries
 from spherloc.experiments.summary import summarize
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.scenes.scene_files import MODEL, SCENE
@@ -437,7 +437,7 @@ def test_what_other_queries_say_is_written_and_told(
 
     def judged(scene, rows, how, report, say):
         report(1, 1)
-        trace = next(trace for _, trace in localize(scene, scene.queries[2:], *how[:3]))
+        trace = next(trace for _, trace in localize_queries(scene, scene.queries[2:], *how[:3]))
         yield rows[1].doubted(why), None
         yield replace(rows[2], inliers=7), trace
 
@@ -470,7 +470,7 @@ def test_a_query_that_is_tried_anew_keeps_one_recording(
     records = Records(out / "recordings")
 
     def judged(scene, rows, how, report, say):
-        trace = next(trace for _, trace in localize(scene, scene.queries[1:], *how[:3]))
+        trace = next(trace for _, trace in localize_queries(scene, scene.queries[1:], *how[:3]))
         yield replace(rows[1], inliers=rows[1].inliers - 1), trace
 
     assert run(scene, out, estimator="mc", records=records) == 0

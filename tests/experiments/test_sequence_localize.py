@@ -20,7 +20,7 @@ from spherloc.estimators import options_type
 from spherloc.experiments import SequenceResults
 from spherloc.experiments.configuration import configuration_of
 from spherloc.experiments.results import QueryResult
-from spherloc.experiments.sequence import How, chosen_queries, localize, localize_by_each
+from spherloc.experiments.sequence import How, chosen_queries, localize_by_each, localize_queries
 from spherloc.experiments.summary import (
     estimated_trajectory,
     summarize,
@@ -40,7 +40,7 @@ def scene_of(folder: Path, **keys) -> MapScene:
 
 
 def solve(scene: MapScene, estimator: str = "mc") -> list:
-    return list(localize(scene, scene.queries, estimator, options_type(estimator)(), 0))
+    return list(localize_queries(scene, scene.queries, estimator, options_type(estimator)(), 0))
 
 
 def results_of(scene: MapScene, rows) -> SequenceResults:
@@ -139,7 +139,7 @@ def test_the_next_query_is_matched_while_one_is_solved(tmp_path: Path) -> None:
             assert go_on.wait(LIMIT_S)
         return scene.matcher(view)
 
-    found = localize(replace(scene, matcher=watched), scene.queries, "mc", options_type("mc")(), 0)
+    found = localize_queries(replace(scene, matcher=watched), scene.queries, "mc", options_type("mc")(), 0)
     assert next(found)[0].query == "image0.png"  # though the matching of image1.png is not done
     assert [name for name, _ in begun][:1] == ["image0.png"] and len(begun) <= 2
     go_on.set()

@@ -12,7 +12,7 @@ from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.datasets.map_scene import MapScene
 from spherloc.estimators import options_type
 from spherloc.experiments.results import DOUBTFUL, FAILED, LOCALIZED, QueryResult
-from spherloc.experiments.sequence import How, localize
+from spherloc.experiments.sequence import How, localize_queries
 from spherloc.frontend.view import Gravity, Matches, View
 from spherloc.geometry import DOWN, camera_centre, pose, transform, yaw_rotation
 from spherloc.mapping.rig import rig_of
@@ -80,7 +80,7 @@ def scene_of(
     queries = [View(f"{camera}/{time:03d}.png", CAMERA, image, gravity=down) for camera in cameras for time in range(6)]
     matcher = Drawn(references[0], counts)
     scene = MapScene("drive", "drive.toml", tuple(queries), tuple(references), matcher, DOWN)
-    rows = [row for row, _ in localize(scene, scene.queries, *HOW[:3])]
+    rows = [row for row, _ in localize_queries(scene, scene.queries, *HOW[:3])]
     matcher.tried.clear()
     if shifted:
         late = [row for row in rows if row.query.startswith(cameras[-1])]

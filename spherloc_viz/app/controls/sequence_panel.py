@@ -12,7 +12,7 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import SpherlocError, shorten
 from spherloc.experiments.kept_results import kept_results
 from spherloc.experiments.results import LOCALIZED, QueryResult
-from spherloc.experiments.sequence import How, localize
+from spherloc.experiments.sequence import How, localize_queries
 from spherloc.experiments.summary import success_rates
 from spherloc.mapping.scenes.joint_outcome import judged_together
 from spherloc.trace import Trace
@@ -142,7 +142,7 @@ class SequencePanel:
             label, scene, estimator, options, seed = self._chosen()
             with self._lock:
                 self._rows[label] = ()
-            for row, trace in localize(scene, scene.queries, estimator, options, seed):
+            for row, trace in localize_queries(scene, scene.queries, estimator, options, seed):
                 with self._lock:
                     rows = self._rows[label] = (*self._rows[label], row)
                 self._bar.value = 100.0 * len(rows) / len(scene.queries)
