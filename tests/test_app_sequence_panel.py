@@ -30,7 +30,7 @@ def test_what_is_tried_anew_is_told_apart_from_what_is_localized_first(
     queries = tuple(SimpleNamespace(name=row.query) for row in rows)
     scene = SimpleNamespace(queries=queries, thresholds=((5.0, 0.5),), metric=True, about_truth="")
     told: list[tuple[object, bool]] = []
-    monkeypatch.setattr(sequence_panel, "localize", lambda *how: ((row, f"first {row.query}") for row in rows))
+    monkeypatch.setattr(sequence_panel, "localize_queries", lambda *how: ((row, f"first {row.query}") for row in rows))
     monkeypatch.setattr(
         sequence_panel, "judged_together", lambda *how: iter([(replace(rows[1], inliers=9), "second b")])
     )

@@ -437,7 +437,7 @@ def test_the_history_of_ransac_ends_where_the_step_is(ransac: Trace) -> None:
     mask = stage.inlier_masks[-1]
     share, best = mask.mean(), int(stage.improved_at[-1]) + 1
     picture = at(ransac, "samples-drawn")
-    assert f"with probability {1 - (1 - share**2) ** best:.3g}" in picture.step.caption
+    assert f"drawn by then is {1 - (1 - share**2) ** best:.3g}." in picture.step.caption
     chances = next(chart for chart in picture.charts if chart.name == "chance").curves[0]
     np.testing.assert_allclose(chances.y, 1 - (1 - share**2) ** chances.x, atol=1e-12)
 

@@ -79,8 +79,8 @@ def _bound(view: RunView, stage: ConsensusStage) -> Frame:
     left = f"{open_share:.3g} % of all yaws could hide a better one" if open_share else "no yaw could hide a better one"
     if stage.arcs:
         why = (
-            f"Matches that one pose explains agree in pairs at its yaw, as {stage.arcs:,} arcs tell, so the largest "
-            "set that agrees at a yaw is a bound"
+            f"The {stage.arcs:,} arcs tell which pairs of matches agree at a yaw, and matches that one pose explains "
+            "all agree in pairs, so the largest such set is a bound"
         )
         formula = f"max over θ of ω(G(θ)) = {most},  ij ∈ G(θ) ⇔ |f_ij(θ)| ≤ τ_ij"
     else:

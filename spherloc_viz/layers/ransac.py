@@ -140,14 +140,13 @@ def _expected(view: RunView, stage: RansacStage) -> Frame:
     clean = mask[stage.samples].all(axis=1) & ~stage.locally_optimized
     if clean.any():
         first = int(stage.improved_at[np.flatnonzero(clean)[0]]) + 1
-        met = f"the first to improve on those before was sample {first:,}"
+        met = f"the first of these that improved on the best so far was sample {first:,}"
     else:
-        met = "no improvement came from one"
-    mean = f"one sample in {1.0 / share**size:,.0f}" if share else "no sample"
+        met = "none of these improved on the best so far"
+    mean = f"one sample in {1.0 / share**size:,.0f} is expected" if share else "no sample is expected"
     return Frame(
-        f"With {100 * share:.3g} % inliers, {mean} should hold only inliers of the best pose, and {met}. "
-        f"The best pose came with sample {best:,}, by which a clean one was to be expected with probability "
-        f"{by_then:.3g}.",
+        f"With {100 * share:.3g} % inliers, {mean} to hold only inliers of the best pose; {met}. The best pose came "
+        f"with sample {best:,}; the probability that such a sample is drawn by then is {by_then:.3g}.",
         f"P = 1 − (1 − wⁿ)ᵏ,  n = {size},  w = {share:.3g},  k = {best:,}   (Eq. 28)",
         view.aligned_pose(stage.cam_from_map[-1]),
         view.colors(style.UNDECIDED, (mask, style.INLIER)),
