@@ -57,7 +57,8 @@ def _built(folder: Path, request: MapRequest, tell: Tell) -> Built:
         views, _ = Masks(nadir_deg=carried_deg).on(views)
         masks = replace(masks or Masks(), nadir_deg=carried_deg)
     known = {} if request.stated is None else request.stated.found
-    lines = gravity_by_lines(views, tell, known)
+    fixed = request.measured.fixed
+    lines = gravity_by_lines(views, tell, known, {} if fixed is None else fixed.body_from_camera)
     believed = {**known, **({} if lines.unsure else lines.found)}
     down = [believed.get(view.name) for view in views]
     models = kept_or_made(views, down, folder, request.how, lambda: reconstruct(views, down, folder, tell, request.how))

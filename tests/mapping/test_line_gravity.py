@@ -14,7 +14,13 @@ from spherloc.errors import InputError
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN, camera_centre, pose, so3_exp
 from spherloc.mapping.alignment.gravity_check import check_stated
-from spherloc.mapping.alignment.line_gravity import RIGHT, GravityByLines, gravity_by_lines, share_below
+from spherloc.mapping.alignment.line_gravity import (
+    RIGHT,
+    GravityByLines,
+    gravity_by_lines,
+    share_below,
+    upright_in_body,
+)
 from spherloc.mapping.alignment.stated_gravity import StatedGravity
 
 COUNT = 7
@@ -106,6 +112,28 @@ def test_a_camera_that_has_not_turned_does_not_tell(upright, tmp_path):
     other = replace(lines.other, found={view.name: lines.other.found[views[0].name] for view in views})
     found = replace(both, other=other).in_maps(*maps_of(same))
     assert found.unsure and not found.sideways
+
+
+def car_camera(yaw_deg: float, roll_deg: float = 0.0) -> np.ndarray:
+    """``body_from_camera`` (4, 4) of a camera of a car, x forward, y left, z up, that looks to a side and 20° down."""
+    upright = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    look = so3_exp(np.radians([0.0, 0.0, yaw_deg])) @ upright @ so3_exp(np.radians([-20.0, 0.0, 0.0]))
+    found = np.eye(4)
+    found[:3, :3] = look @ so3_exp(np.radians([0.0, 0.0, roll_deg]))
+    return found
+
+
+def test_cameras_that_look_to_all_sides_are_upright(upright, tmp_path):
+    """A calibration says so: what is below in their images is one direction of the car. That of cameras which look the
+    same way does not, nor one of cameras that are all turned by 90°."""
+    sides = (0.0, 90.0, 180.0, -90.0)
+    bodies = [car_camera(yaw_deg) for yaw_deg in sides]
+    assert upright_in_body(bodies) and upright_in_body([car_camera(yaw_deg, 180.0) for yaw_deg in sides])
+    assert not upright_in_body(bodies[:1] * 2) and not upright_in_body([])
+    assert not upright_in_body([car_camera(yaw_deg, 90.0) for yaw_deg in sides])
+    views = turned(upright, tmp_path, 1)
+    lines = gravity_by_lines(views, quiet, None, {view.name: bodies[k % 4] for k, view in enumerate(views)})
+    assert not lines.sideways and lines.other is None
 
 
 def test_gravity_that_a_file_states_shows_where_to_look_in_the_others(upright, tmp_path):

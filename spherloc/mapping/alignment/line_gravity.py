@@ -35,6 +35,8 @@ CLEARLY_MORE = 1.25
 """Images are stored sideways if this many times more of them agree so than upright."""
 FEW = 2
 """So many more are counted for a share, as a few images agree by chance."""
+SAME_WAY, APART_WAYS = 0.8, 0.6
+"""Lengths of the mean of directions that are about the same, and of such as are not."""
 LEANING_DEG = 20.0
 """If images lean more than that in the median and would agree as well sideways, they may be stored sideways."""
 
@@ -100,11 +102,17 @@ def share_below(poses: Mapping[str, FloatArray], points: FloatArray, down: Float
     return float(np.mean((points - centres[KDTree(centres).query(points)[1]]) @ down > 0.0))
 
 
-def gravity_by_lines(views: Sequence[View], tell: Tell, stated: Mapping[str, Gravity] | None = None) -> GravityByLines:
+def gravity_by_lines(
+    views: Sequence[View],
+    tell: Tell,
+    stated: Mapping[str, Gravity] | None = None,
+    body_from_camera: Mapping[str, FloatArray] | None = None,
+) -> GravityByLines:
     """Gravity of those images whose vertical lines show it, and the reasons of the others.
 
     It is searched below, but where images of the same camera have ``stated`` gravity, around that. If none has, and
-    none is a panorama, images may be stored sideways. ``tell`` is called after each image.
+    none is a panorama, images may be stored sideways, unless how their cameras are fixed to each other
+    (``body_from_camera`` (4, 4), by the name of the image) says that they are not. ``tell`` is called after each image.
     """
     todo = [view for view in views if view.name not in (stated or {})]
     near = _stated_directions(views, stated or {})
@@ -130,7 +138,7 @@ def gravity_by_lines(views: Sequence[View], tell: Tell, stated: Mapping[str, Gra
         tell("images searched for vertical lines", done, len(todo))
     upright, sideways = ({view.name: ways[view.name][way] for view in todo} for way in (0, 1))
     free = [v for v in todo if repr(v.camera) not in near and not isinstance(v.camera, Equirectangular)]
-    if not free or len(free) < len(todo):
+    if not free or len(free) < len(todo) or upright_in_body(list((body_from_camera or {}).values())):
         return _told(upright, sideways=False)
     more, better = _steady_shares(free, sideways) - _steady_shares(free, upright)
     one, other = _told(upright, sideways=False), _told(sideways, sideways=True)
@@ -140,6 +148,16 @@ def gravity_by_lines(views: Sequence[View], tell: Tell, stated: Mapping[str, Gra
         return replace(one, other=other)
     told = more >= CLEAR and better > 0.0
     return replace(other, other=one) if told else replace(one, unsure=True, other=other)
+
+
+def upright_in_body(body_from_camera: Sequence[FloatArray]) -> bool:
+    """Whether cameras that are fixed to each other, (4, 4) each, are upright or all upside down: what is below in their
+    images is about the same direction then, and what is at their right is not."""
+    if not body_from_camera:
+        return False
+    rotations = np.unique(np.round([one[:3, :3] for one in body_from_camera], 3), axis=0)
+    below, right = (float(np.linalg.norm(np.mean(rotations @ axis, axis=0))) for axis in (DOWN, RIGHT))
+    return below >= SAME_WAY and right <= APART_WAYS
 
 
 def _told(found: Mapping[str, Gravity | str], *, sideways: bool) -> GravityByLines:
