@@ -4,12 +4,14 @@
     .venv/bin/python -m benchmarks.maps --features sift+aliked           # with the extra ``learned``
 
 A world, a number of panoramas, evenly along its path, and the world's seed (0 if none is given) are one row; with
-``uneven`` behind it exposure, colour, sharpness and noise differ, as in photographs that one takes in passing. Each of
+``uneven`` behind it exposure, colour, sharpness and noise differ, as in photographs that one takes in passing, with
+``plain`` textures have a third of their contrast, as in rooms with plain walls. Each of
 the maps that ``spherloc map`` makes of them is put onto the truth by the similarity that most of its images agree with;
 an image that is then more than ``WRONG_M`` off is wrong. Maps of two images are not judged. Needs the extra ``colmap``.
 """
 
 import argparse
+from collections.abc import Callable, Mapping
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,6 +32,8 @@ from spherloc_viz.commands.map import how_of
 SETS = (
     *(f"apartment:{count}" for count in (10, 12, 16, 22)),
     *(f"apartment:14:{seed}:uneven" for seed in (21, 22, 23, 24)),
+    "apartment:16:101:plain",
+    "apartment:16:103:plain",
     "campus:12",
     "campus:20",
 )
@@ -65,7 +69,20 @@ def uneven(image: ByteArray, rng: np.random.Generator) -> ByteArray:
     return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)
 
 
-def photographed(world: str, count: int, seed: int, change: bool, folder: Path) -> dict[str, FloatArray]:
+def plain(image: ByteArray, rng: np.random.Generator) -> ByteArray:
+    """A rendered image (H, W, 3) with faint textures, an exposure of its own and noise."""
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 15.0)
+    faint = np.clip((smooth + 0.35 * (image - smooth)) * rng.uniform(0.7, 1.3), 0.0, 255.0)
+    noisy = np.clip(faint + rng.normal(0.0, 1.5, image.shape), 0.0, 255.0).astype(np.uint8)
+    _, packed = cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)
+
+
+CHANGES: Mapping[str, Callable[[ByteArray, np.random.Generator], ByteArray]] = {"uneven": uneven, "plain": plain}
+"""What makes photographs of rendered images."""
+
+
+def photographed(world: str, count: int, seed: int, change: str, folder: Path) -> dict[str, FloatArray]:
     """Write the panoramas into a folder; returns their true positions (3,), metres, by name."""
     rng = np.random.default_rng(seed)
     path = folder.with_suffix(".toml")
@@ -74,7 +91,7 @@ def photographed(world: str, count: int, seed: int, change: bool, folder: Path) 
     places = {}
     for view in load_scene(path).references:
         name = f"{view.name}.png"
-        cv2.imwrite(str(folder / name), uneven(view.read(), rng) if change else view.read())
+        cv2.imwrite(str(folder / name), CHANGES[change](view.read(), rng) if change else view.read())
         places[name] = camera_centre(view.cam_from_map)
     return places
 
@@ -114,9 +131,9 @@ def cells(folder: Path, places: dict[str, FloatArray], features: str) -> str:
     return f"{sizes} | {len(right)} | {wrong} | {median} |"
 
 
-def row(world: str, count: int, seed: int, change: bool, features: str) -> str:
+def row(world: str, count: int, seed: int, change: str, features: str) -> str:
     """One line of the table."""
-    title = f"{world}, {count}" + (f", seed {seed}" if seed else "") + (", uneven" if change else "")
+    title = f"{world}, {count}" + (f", seed {seed}" if seed else "") + (f", {change}" if change else "")
     with TemporaryDirectory() as place:
         folder = Path(place) / "panoramas"
         return f"| {title} | {cells(folder, photographed(world, count, seed, change, folder), features)}"
@@ -125,14 +142,14 @@ def row(world: str, count: int, seed: int, change: bool, features: str) -> str:
 def main() -> None:
     """Print the table."""
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("sets", nargs="*", default=SETS, metavar="WORLD:COUNT[:SEED[:uneven]]")
+    words.add_argument("sets", nargs="*", default=SETS, metavar="WORLD:COUNT[:SEED[:uneven|plain]]")
     words.add_argument("--features", default="sift")
     given = words.parse_args()
     print("| panoramas | maps of | right | wrong | median of the right ones, cm |\n|---|---|---|---|---|")
     for one in given.sets:
         world, count, *more = one.split(":")
         seed = int(more[0]) if more else 0
-        print(row(world, int(count), seed, "uneven" in more, given.features), flush=True)
+        print(row(world, int(count), seed, more[1] if len(more) > 1 else "", given.features), flush=True)
 
 
 if __name__ == "__main__":

@@ -45,6 +45,8 @@ class Kind:
     """Number of features that are kept, the strongest, unless the options give another."""
     weak: Run | None = None
     """Finds weaker ones, too; None if this kind has no threshold for that."""
+    strong: float = -np.inf
+    """Least score of those that are no weaker ones."""
 
 
 def detect(
@@ -137,7 +139,13 @@ def _aliked(image: ByteArray, mask: ByteArray, most: int, weights: Path | None) 
 
 KINDS = {
     # Two standard deviations of the Gaussian at which the keypoint was found: each detector defines size differently.
-    "sift": Kind(_sift, reach=1.0, weak=partial(_sift, contrast=WEAK_SIFT_CONTRAST)),
+    "sift": Kind(
+        _sift,
+        reach=1.0,
+        weak=partial(_sift, contrast=WEAK_SIFT_CONTRAST),
+        # OpenCV compares the threshold with the score, in single precision, times the number of layers of an octave.
+        strong=SIFT_CONTRAST / 3 - 1e-7,
+    ),
     "orb": Kind(_orb, reach=0.2, binary=True),
     "akaze": Kind(_akaze, reach=0.7, binary=True),
     "surf": Kind(_surf, reach=0.5),

@@ -165,6 +165,11 @@ class Features:
     def __len__(self) -> int:
         return len(self.pixels)
 
+    @property
+    def strong(self) -> int:
+        """Number of features, the first ones, that are no weaker ones, which only images with few features get."""
+        return int(np.count_nonzero(self.scores >= KINDS[self.method].strong))
+
 
 def extract(view: View, options: FeatureOptions | None = None) -> Features:
     """Features of an image, from the cache on disk if they were computed before.

@@ -31,9 +31,11 @@ Floats = NDArray[np.float32]
 def real_descriptors(features: Features) -> Floats:
     """Descriptors (N, D) of the strongest features as unit vectors; bits of binary ones count as +1 and -1.
 
-    Of joined kinds, the first is taken: VLAD compares features of one kind.
+    Weak features, which are those of plain walls and of noise, tell no place. Of joined kinds, the first is taken: VLAD
+    compares features of one kind.
     """
-    descriptors = (features.parts[0] if features.parts else features).descriptors[:STRONGEST]
+    first = features.parts[0] if features.parts else features
+    descriptors = first.descriptors[: min(STRONGEST, first.strong)]
     if descriptors.dtype == np.uint8:
         descriptors = 2.0 * np.unpackbits(descriptors.astype(np.uint8), axis=1) - 1.0
     lengths = np.linalg.norm(descriptors, axis=1, keepdims=True)

@@ -17,7 +17,7 @@ from spherloc.frontend.view import Matcher, Matches, NeedsPreparing, Report, Vie
 SUFFIX = ".npz"
 """Ending of the name of the file beside a scene file."""
 MAX_BYTES = 20_000_000
-VERSION = 3
+VERSION = 4
 """Number to be increased when pictures, features or matching change, so that old stored matches are not used."""
 
 

@@ -58,7 +58,7 @@ def test_localizes_a_real_frame(tmp_path, t265, camera, other):
     # From all of them, and from the other camera alone, which was 64 mm away.
     places = [index for index, view in enumerate(matches.references) if view.name.startswith(other)]
     beside = np.isin(matches.reference_index, places)
-    for kept, degrees, metres in ((np.ones(len(beside), bool), 0.3, 0.006), (beside, 0.4, 0.008)):
+    for kept, degrees, metres in ((np.ones(len(beside), bool), 0.3, 0.006), (beside, 0.5, 0.008)):
         some = replace(
             matches,
             pixels=matches.pixels[kept],
