@@ -8,6 +8,7 @@ import pytest
 
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.geometry import camera_centre, pose, so3_exp, transform, yaw_rotation
+from spherloc.mapping.models import reconstruction
 from spherloc.mapping.models.joining import joined_by_pairs
 from spherloc.mapping.models.model import Reconstruction
 from spherloc.mapping.models.pair_evidence import PairEvidence, distance_of
@@ -224,3 +225,16 @@ def test_the_distance_is_that_on_which_points_agree(rng):
     parallel = far @ turn.T + 1.3 * direction
     parallel /= np.linalg.norm(parallel, axis=1, keepdims=True)
     assert distance_of(far, parallel, turn, direction) is None, "far points do not tell it"
+
+
+def test_a_model_without_points_is_none(monkeypatch, tmp_path):
+    """COLMAP gives one with images where bundle adjustment diverged: the other conditions for a first pair are tried."""
+    tried = []
+
+    def mapped(_pycolmap, _database, _folder, options, _tell):
+        tried.append(options.mapper.init_min_num_inliers)
+        return {0: pycolmap.Reconstruction()}
+
+    monkeypatch.setattr(reconstruction, "_mapped", mapped)
+    assert reconstruction._models(pycolmap, tmp_path / "matches.db", tmp_path, 3, lambda *_: None) == []
+    assert tried == [50, 25, 15]

@@ -266,7 +266,9 @@ def _models(pycolmap: Any, database: Path, folder: Path, count: int, tell: Tell)
         for key, value in first_pair.items():
             setattr(mapper, key, value)
         found = _mapped(pycolmap, database, folder, options, lambda done: tell("images mapped", done, count))
-        models = sorted(found.values(), key=lambda model: -model.num_reg_images())
+        # A model whose bundle adjustment has diverged keeps its images and no points.
+        whole = [model for model in found.values() if model.num_points3D() >= MIN_MATCHES]
+        models = sorted(whole, key=lambda model: -model.num_reg_images())
         if models and models[0].num_reg_images() > count / 2:
             break
     return models
