@@ -228,7 +228,7 @@ def test_the_distance_is_that_on_which_points_agree(rng):
 
 
 def test_a_model_without_points_is_none(monkeypatch, tmp_path):
-    """COLMAP gives one with images where bundle adjustment diverged: the other conditions for a first pair are tried."""
+    """COLMAP gives one with images where bundle adjustment diverged: other conditions for a first pair are tried."""
     tried = []
 
     def mapped(_pycolmap, _database, _folder, options, _tell):
