@@ -21,12 +21,23 @@ from spherloc.mapping.scenes.scene_files import (
     MapHead,
     _camera,
     _queries,
+    own_queries,
     write_new_scene,
 )
 from spherloc_viz.commands.map import (
     _calibrated,
     _sizes,
 )
+
+
+def test_every_camera_of_several_has_queries_and_references():
+    """In the order of names, every fourth image of four cameras is the same one's."""
+    cameras = ("FV", "MVL", "MVR", "RV")
+    names = [f"{time:05d}_{camera}.png" for time in range(6) for camera in cameras]
+    chosen = own_queries(names)
+    counts = [sum(name.endswith(f"_{camera}.png") for name in chosen) for camera in cameras]
+    assert sum(counts) == 6 and max(counts) == 2 and min(counts) == 1 and chosen == sorted(chosen)
+    assert own_queries([f"{k}.png" for k in range(9)]) == ["3.png", "7.png"] and own_queries(["a.png"]) == ["a.png"]
 
 
 def test_new_images_are_counted_by_their_size(tmp_path, rng):

@@ -21,6 +21,7 @@ from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.alignment.true_poses import AlignedTruth
 from spherloc.mapping.images.photographs import CalibratedLens, cameras_of
+from spherloc.mapping.rig import camera_and_key
 from spherloc.mapping.scenes.new_images import NewImages
 
 MODEL = "model"
@@ -75,10 +76,18 @@ def scene_text(head: MapHead, names: Sequence[str]) -> str:
         f"images = {toml_text(head.images)}",
         head.units,
         "# Localized against the other images; those of the map that you name here are left out of it.",
-        f"queries = {_names(names[EVERY - 1 :: EVERY] or names[-1:])}",
+        f"queries = {_names(own_queries(names))}",
         *head.sections,
     ]
     return "\n".join(lines) + "\n"
+
+
+def own_queries(names: Sequence[str]) -> list[str]:
+    """Every fourth image of a map of these ``names``, or the last one. Those of one camera are counted one after
+    another: of four cameras, every fourth image may be the same one's, which then would have no reference."""
+    by_camera = sorted(names, key=lambda name: camera_and_key(name)[0])
+    chosen = set(by_camera[EVERY - 1 :: EVERY] or by_camera[-1:])
+    return [name for name in names if name in chosen]
 
 
 def new_scene_text(
