@@ -67,9 +67,9 @@ def test_without_points_there_is_no_picture(tmp_path):
 
 def test_names_below_thumbnails_tell_images_apart():
     """Their ends, without what all have, in two lines."""
-    assert end_of("hall_1.png", 2.0) == "hall_1"
-    assert end_of("slam-side-right_7385324932864.png", 1.0) == "…7385324932864"
-    assert end_of("slam-side-right_7385324932864.png", 2.0) == "…am-side-right_7385324932864"
+    assert end_of("hall_1.png", 104) == "hall_1"
+    assert end_of("slam-side-right_7385324932864.png", 52) == "…7385324932864"
+    assert end_of("slam-side-right_7385324932864.png", 104) == "…am-side-right_7385324932864"
 
 
 def test_the_strip_is_sorted_turned_and_told(tmp_path):

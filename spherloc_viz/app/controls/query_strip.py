@@ -12,6 +12,7 @@ from pathlib import Path, PurePosixPath
 
 import cv2
 
+from spherloc.cameras.base import Camera
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError
 from spherloc.experiments.results import DOUBTFUL, FAILED, LOCALIZED, UNREADABLE, QueryResult
@@ -190,15 +191,15 @@ def _cell(view: View, picture: str, row: QueryResult | None, unit: str) -> str:
             f'<span aria-hidden="true" style="position:absolute;right:0;bottom:0;padding:0 .3em;color:#fff;'
             f'background:rgba(20,24,32,.75);font-weight:700">{sign}</span>'
         )
-    said = said_of(view.name, row, unit)
+    said, width_px = said_of(view.name, row, unit), width_of(view.camera)
     image = (
         f'<img alt="" src="{picture}" style="display:block;height:{HEIGHT_PX}px">'
         if picture
-        else f'<div style="width:{HEIGHT_PX}px;height:{HEIGHT_PX}px;background:rgba(128,140,160,.2)"></div>'
+        else f'<div style="width:{width_px}px;height:{HEIGHT_PX}px;background:rgba(128,140,160,.2)"></div>'
     )
     # As wide as the picture, to which it must not give a width of its own.
     wrapped = "width:0;min-width:100%;overflow-wrap:anywhere;line-height:1.15"
-    words = escape(end_of(view.name, view.camera.width / view.camera.height))
+    words = escape(end_of(view.name, width_px))
     name = f'<div aria-hidden="true" style="{wrapped};text-align:center;{DIM}">{words}</div>'
     return (
         f'<div role="listitem"><div role="button" tabindex="0" data-touch="strip-open:{escape(view.name)}" '
@@ -208,11 +209,16 @@ def _cell(view: View, picture: str, row: QueryResult | None, unit: str) -> str:
     )
 
 
-def end_of(name: str, shape: float) -> str:
-    """As much of a query's name without its suffix as fits below a thumbnail, the end, which tells queries apart;
-    ``shape`` is the image's width by its height."""
+def width_of(camera: Camera) -> int:
+    """Width of a thumbnail, px."""
+    return round(min(MAX_WIDTH_PX, HEIGHT_PX * camera.width / camera.height))
+
+
+def end_of(name: str, width_px: int) -> str:
+    """As much of a query's name without its suffix as fits below a thumbnail of that width, the end, which tells
+    queries apart."""
     stem = name.removesuffix(PurePosixPath(name).suffix)
-    room = LINES * int(min(MAX_WIDTH_PX, shape * HEIGHT_PX) / LETTER_PX)
+    room = LINES * (width_px // LETTER_PX)
     return stem if len(stem) <= room else f"…{stem[1 - room :]}"
 
 
