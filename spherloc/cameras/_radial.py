@@ -6,6 +6,7 @@ from math import inf
 
 import numpy as np
 
+from spherloc.cameras._checks import FocalCamera
 from spherloc.types import BoolArray, FloatArray
 
 RIM_MARGIN = 1e-6
@@ -164,3 +165,40 @@ def _polar(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
     theta_d = np.hypot(x, y)
     on_axis = theta_d <= _ON_AXIS
     return np.where(on_axis, 1.0, x / theta_d), np.where(on_axis, 0.0, y / theta_d), theta_d
+
+
+class RadialCamera(FocalCamera):
+    """A camera whose lens is an ``AngleCurve`` alone."""
+
+    def _angle_curve(self) -> AngleCurve:
+        """The curve by the camera's coefficients."""
+        raise NotImplementedError
+
+    @cached_property
+    def _curve(self) -> AngleCurve:
+        return self._angle_curve()
+
+    @property
+    def max_angle_rad(self) -> float:
+        """Largest angle to the optical axis that the model can invert: the first maximum of theta_d, at most pi."""
+        return self._curve.max_angle_rad
+
+    def _plane_points(self, points: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Directions within ``max_angle_rad`` of the optical axis are valid."""
+        return self._curve.plane(points)
+
+    def _bearings(self, pixels: FloatArray) -> FloatArray:
+        """Unit bearings (N, 3) of pixels (N, 2); NaN beyond the rim."""
+        return self._curve.bearings(*self.plane(pixels))
+
+    def unprojection_jacobian(self, pixels: FloatArray) -> FloatArray:
+        """d bearing / d pixel (N, 3, 2), per pixel; NaN where ``unproject`` is invalid."""
+        with np.errstate(all="ignore"):
+            return self._curve.jacobian(*self.plane(pixels)) / (self.fx, self.fy)
+
+    def check_curve(self, coefficient_names: str) -> None:
+        """Check and normalise all values while the camera is being constructed; raises ``CalibrationError`` for an
+        unusable one, and if the lens cannot unproject any pixel of the image."""
+        self.check_lens(coefficient_names)
+        with np.errstate(all="ignore"):
+            self.check_sees_image(self._curve.end)
