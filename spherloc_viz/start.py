@@ -1,10 +1,12 @@
 """Start of the command line, before anything large is imported: lists all commands on one screen if none is named."""
 
+import atexit
 import difflib
 import os
 import shlex
 import signal
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -36,9 +38,23 @@ def main() -> None:
     signal.signal(signal.SIGINT, heard)
     try:
         cli.main()
-    finally:
+    except SystemExit as ended:
         if heard is signal.default_int_handler:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
+        if isinstance(ended.code, int):
+            _end_with_threads(ended.code)
+        raise
+
+
+def _end_with_threads(code: int) -> None:
+    """End the process if other threads are still at work; all that is worth keeping is on the disk.
+
+    Python itself would wait for those of pools, and before 3.14 stop the others where they next need its lock, which
+    aborts the process if C++ called them, as OpenCV and COLMAP do.
+    """
+    if threading.active_count() > 1:
+        atexit._run_exitfuncs()
+        os._exit(code)
 
 
 def _print(text: str) -> None:

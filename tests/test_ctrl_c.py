@@ -70,3 +70,23 @@ def test_who_is_not_interrupted_gets_the_run_and_its_errors() -> None:
     assert solve(problem, "mc", options, 3).message == estimate(problem, "mc", options, 3).message
     with pytest.raises(InputError, match="unknown estimator"):
         solve(problem, "magic", options, 3)
+
+
+def test_a_thread_inside_opencv_is_no_reason_to_abort() -> None:
+    """Python stops such a thread at its end, and OpenCV cannot be stopped."""
+    program = """
+import sys, threading
+import cv2, numpy as np
+def blur():
+    image = np.zeros((500, 500), np.uint8)
+    while True:
+        cv2.GaussianBlur(image, (0, 0), 5)
+threading.Thread(target=blur, daemon=True).start()
+threading.Thread(target=threading.Event().wait).start()  # one that would be waited for, for ever
+from spherloc_viz.start import main
+sys.argv = ["spherloc", "scenes"]
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=LIMIT_S)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "street_fisheye" in done.stdout

@@ -1,7 +1,6 @@
 """What the commands take that localize images or make maps of them, or say why poses are wrong; the work is done by the
 other modules of this folder."""
 
-import os
 import shlex
 from collections.abc import Sequence
 from itertools import chain
@@ -14,7 +13,6 @@ from tyro.conf import Positional, arg
 from spherloc.errors import InputError
 from spherloc.files import is_file, is_folder
 from spherloc_viz.commands.flags import (
-    INTERRUPTED,
     RECORDINGS,
     Flag,
     OptionalFloat,
@@ -98,18 +96,14 @@ def localize(
         return Solving(*_name_and_options(name, option), folder, kept, initialise, numbered)
 
     names = estimator or ("auto",)
-    try:
-        if len(paths) == len(names) == 1:
-            words = names[0] if initialise is None else f"{initialise}+{names[0]}"
-            folder = output or RECORDINGS / f"{_results_name(paths[0])}_{words}_{seed}"
-            one = solving(names[0], folder, numbered=output is None)
-            return localize_sequence(paths[0], [one], seed, queries, retry_failed)
-        base = output or RECORDINGS / f"comparison_{seed}"
-        each = {path: [solving(name, base / _results_name(path) / name) for name in names] for path in paths}
-        return compare_sequences(each, seed, queries, retry_failed, base)
-    except KeyboardInterrupt:
-        # Without waiting for the thread that matches the next query; all that is done is on the disk.
-        os._exit(INTERRUPTED)
+    if len(paths) == len(names) == 1:
+        words = names[0] if initialise is None else f"{initialise}+{names[0]}"
+        folder = output or RECORDINGS / f"{_results_name(paths[0])}_{words}_{seed}"
+        one = solving(names[0], folder, numbered=output is None)
+        return localize_sequence(paths[0], [one], seed, queries, retry_failed)
+    base = output or RECORDINGS / f"comparison_{seed}"
+    each = {path: [solving(name, base / _results_name(path) / name) for name in names] for path in paths}
+    return compare_sequences(each, seed, queries, retry_failed, base)
 
 
 def _results_name(path: Path) -> str:
@@ -379,10 +373,7 @@ def _localize_by_default(scenes: Sequence[Path]) -> int:
         scene: Solving("auto", (), folder, Records(folder / "recordings", keep_gigabytes=None), numbered=True)
         for scene, folder in folders.items()
     }
-    try:
-        return localize_in_maps(solvings)
-    except KeyboardInterrupt:
-        os._exit(INTERRUPTED)  # as in ``localize``
+    return localize_in_maps(solvings)
 
 
 def _play(scene: Path) -> None:
