@@ -23,8 +23,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre, rotation_angle
+from spherloc.mapping.alignment.fixed_images import fixed_images
 from spherloc.mapping.alignment.positions import SimilarityFit, overlaid
-from spherloc.mapping.alignment.rig_scale import fixed_images, scale_by_rig
+from spherloc.mapping.alignment.rig_scale import scale_by_rig
 from spherloc.mapping.alignment.sequence import sequence_data
 from spherloc.mapping.alignment.true_poses import truth_words
 from spherloc.mapping.images.frames import FrameChoice

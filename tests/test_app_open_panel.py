@@ -14,7 +14,7 @@ import pytest
 import viser
 
 from spherloc.datasets.map_scene import MapScene
-from spherloc.mapping.scenes.scene_files import UNITS_UNKNOWN, MapHead, scene_text
+from spherloc.mapping.scenes.scene_files import UNITS_UNKNOWN, MapHead, own_queries, scene_text
 from spherloc_viz.app.panels.open_panel import OpenedScene, OpenPanel, RecentScenes
 from spherloc_viz.app.panels.uploads import MAX_BYTES
 from spherloc_viz.app.web.touch import Touch, Touches
@@ -235,7 +235,7 @@ def test_other_images_of_a_sequence_are_localized_in_its_own_map(
     images = [(*one[:3], name, one[4]) for one, name in zip(model.images, names[::30], strict=True)]
     written = write(folder / "walk_map" / "model", binary_files(replace(model, images=images)))
     head = MapHead("walk (units unknown)", "One.", f"../{place}", UNITS_UNKNOWN, ("", "[gravity]", "map = [0, 0, -1]"))
-    (written.parent / "scene.toml").write_text(scene_text(head, names[::30]))
+    (written.parent / "scene.toml").write_text(scene_text(head, own_queries(names[::30])))
     visitor.touch("open-scene:0:walk_map/scene.toml")
     visitor.touch(f"open-folder:0:0:{place}")
     assert "Localize other images of this sequence in its map" in visitor.panel._list.content
@@ -258,7 +258,7 @@ def test_photographs_are_localized_in_the_map_at_hand(visitor: Visitor, folder: 
         cv2.imwrite(str(path), np.zeros((320, 640), np.uint8))
     written = write(folder / "home_map" / "model", binary_files(sample_model(rng, models=(EQUIRECTANGULAR,))))
     head = MapHead("home (units unknown)", "A map.", "../home", UNITS_UNKNOWN, ("", "[gravity]", "map = [0, 0, -1]"))
-    (written.parent / "scene.toml").write_text(scene_text(head, own))
+    (written.parent / "scene.toml").write_text(scene_text(head, own_queries(own)))
 
     visitor.touch("open-folder:0:0:later")
     assert "localize-folder:0:later" not in visitor.rows, "no map is shown"

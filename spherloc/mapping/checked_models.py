@@ -61,7 +61,8 @@ def _built(folder: Path, request: MapRequest, tell: Tell) -> Built:
     lines = gravity_by_lines(views, tell, known, {} if fixed is None else fixed.body_from_camera)
     believed = {**known, **({} if lines.unsure else lines.found)}
     down = [believed.get(view.name) for view in views]
-    models = kept_or_made(views, down, folder, request.how, lambda: reconstruct(views, down, folder, tell, request.how))
+    how = request.how
+    models = kept_or_made(views, down, folder, how, fixed, lambda: reconstruct(views, down, folder, tell, how, fixed))
     return Built(views, masks, carried_deg, lines, models)
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from spherloc.frontend.masks import Masks
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
+from spherloc.mapping.alignment.fixed_images import FixedImages
 from spherloc.mapping.alignment.positions import Positions
-from spherloc.mapping.alignment.rig_scale import FixedImages
 from spherloc.mapping.alignment.stated_gravity import StatedGravity
 from spherloc.mapping.images.photographs import CalibratedLens
 from spherloc.mapping.scenes.new_images import NewImages

@@ -31,9 +31,9 @@ from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import View
 from spherloc.images import check_image, read_size
 from spherloc.mapping.advice import advice, for_a_page
+from spherloc.mapping.alignment.fixed_images import fixed_images
 from spherloc.mapping.alignment.gravity_check import check_stated
 from spherloc.mapping.alignment.positions import read_positions
-from spherloc.mapping.alignment.rig_scale import fixed_images
 from spherloc.mapping.alignment.sequence import sequence_data
 from spherloc.mapping.alignment.stated_gravity import read_stated_gravity
 from spherloc.mapping.alignment.tag_gravity import stated_by_tags

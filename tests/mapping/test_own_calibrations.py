@@ -10,11 +10,12 @@ from scipy.spatial.transform import Rotation
 from spherloc.cameras import calibration
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.errors import CalibrationError
-from spherloc.mapping.alignment.rig_scale import fixed_images
+from spherloc.mapping.alignment.fixed_images import fixed_images
 from spherloc.mapping.images import found_calibrations
 from spherloc.mapping.images.found_calibrations import calibrations_in, own_files
 from spherloc.mapping.images.given_cameras import given_cameras
 from spherloc.mapping.images.photographs import photographs
+from spherloc.mapping.models.fixed_views import fixed_pairs
 from spherloc.mapping.rig import shots_of
 
 SIZE = 320, 240
@@ -75,6 +76,37 @@ def test_each_image_has_its_own_calibration(car, layout):
     first, second = (fixed.body_from_camera[f"00000_{name}.png"] for name in ("FV", "RV"))
     np.testing.assert_allclose(first[:3, 3] - second[:3, 3], [4.2, 0.0, 0.0])
     np.testing.assert_allclose(first[:3, 2], -second[:3, 2], atol=1e-12)  # they look ahead and back
+
+
+@pytest.mark.parametrize(
+    ("called", "one_time"),
+    [
+        ("{camera}", True),
+        ("00012_{camera}", True),
+        ("{camera}_1700000000.0{number}", True),
+        ("{camera}_1700000000.{number}", False),
+        ("0000{number}_{camera}", False),
+    ],
+)
+def test_images_of_one_moment(tmp_path, rng, called, one_time):
+    """Each is of another camera, and no name says that they were taken one after another."""
+    for number, camera in enumerate(CAMERAS):
+        name = called.format(camera=camera, number=number)
+        picture(tmp_path / f"{name}.png", *SIZE, rng)
+        (tmp_path / f"{name}.json").write_text(json.dumps(as_woodscape(camera)))
+    views = photographs(tmp_path, {}).views
+    fixed, _ = fixed_images(tmp_path, views, None)
+    pairs = fixed_pairs(views, fixed)
+    if not one_time:
+        assert fixed is None and not pairs
+        return
+    assert fixed is not None and fixed.one_time and len(pairs) == 6
+    names = [view.name for view in views]
+    front, rear = (next(k for k, name in enumerate(names) if camera in name) for camera in ("FV", "RV"))
+    rotation, direction = pairs[min(front, rear), max(front, rear)]
+    np.testing.assert_allclose(rotation, np.diag([-1.0, 1.0, -1.0]), atol=1e-12)
+    np.testing.assert_allclose(direction, [0.0, 0.0, -1.0], atol=1e-12)  # each is behind the other
+    assert fixed_images(tmp_path, views[:1], None)[0] is None
 
 
 def test_a_folder_of_calibrations_is_given(car, tmp_path):

@@ -42,7 +42,7 @@ def street(rng, near, sky, wind_deg=0.0, wrong=40):
     return here, unit(np.concatenate(there)), second
 
 
-def two_images(rng, here, there, parts=1, matching=None, promising=(), words=None, camera=CAMERA):
+def two_images(rng, here, there, parts=1, matching=None, promising=(), words=None, camera=CAMERA, fixed=None):
     """``ImagePairs`` of two images whose feature number i is at the bearing number i of each, in as many kinds."""
     words = rng.normal(size=(len(here), 128)).astype(np.float32) if words is None else words
     ones = np.ones(len(here))
@@ -58,7 +58,9 @@ def two_images(rng, here, there, parts=1, matching=None, promising=(), words=Non
     every = np.arange(parts * len(here))
     gravity = [Gravity(DOWN, np.radians(0.5))] * 2
     features = [image(here), image(there)]
-    return ImagePairs(pycolmap, [camera] * 2, features, [every] * 2, gravity, matching or MatchOptions(), promising)
+    known = {} if fixed is None else {(0, 1): (fixed[:, :3], unit(fixed[:, 3]))}
+    matching = matching or MatchOptions()
+    return ImagePairs(pycolmap, [camera] * 2, features, [every] * 2, gravity, matching, promising, known)
 
 
 def test_far_matches_turn_alike(rng):
@@ -79,6 +81,24 @@ def test_one_place_stays_one_place(rng):
     pair = two_images(rng, np.concatenate([rays, wrong[0]]), np.concatenate([there, wrong[1]]))
     _, geometry = pair.compare(0, 1)
     assert geometry is not None and pair.same_place(geometry)
+
+
+def test_a_calibration_tells_a_pose_that_few_matches_fit(rng):
+    """Too few to find one among so many wrong ones; a pose that they do not fit is not taken."""
+    here, there, second = street(rng, 18, 0, wrong=800)
+    assert two_images(rng, here, there).compare(0, 1)[1] is None
+    pair = two_images(rng, here, there, fixed=second)
+    matches, geometry = pair.compare(0, 1)
+    assert geometry is not None and pair.is_as_fixed((0, 1), geometry)
+    assert pair.sureness(0, 1, matches, geometry) == np.inf
+    assert len(set(geometry.inlier_matches[:, 0].tolist()) & set(range(18))) >= 15
+    wrong = pose(yaw_rotation(0.9), second[:, 3])
+    assert two_images(rng, here, there, fixed=wrong).compare(0, 1)[1] is None
+    here, there, second = street(rng, 150, 0)
+    pair = two_images(rng, here, there, fixed=wrong)
+    matches, geometry = pair.compare(0, 1)
+    assert geometry is not None and not pair.is_as_fixed((0, 1), geometry)
+    assert rotation_angle(relative(geometry)[0] @ second[:, :3].T) < np.radians(0.7), "as the matches have it"
 
 
 def test_what_is_high_in_either_image_may_be_sky(rng):

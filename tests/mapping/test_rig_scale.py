@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre, pose
+from spherloc.mapping.alignment.fixed_images import FixedImages, fixed_images
 from spherloc.mapping.alignment.positions import Positions
 from spherloc.mapping.alignment.rig_poses import expected_by_calibration, turned_otherwise
-from spherloc.mapping.alignment.rig_scale import FixedImages, doubt_of_scale, fixed_images, scale_by_rig
+from spherloc.mapping.alignment.rig_scale import doubt_of_scale, scale_by_rig
 from spherloc.mapping.alignment.upright import Level, MapScale
 from spherloc.mapping.images.given_cameras import given_cameras
 from spherloc.mapping.images.photographs import photographs

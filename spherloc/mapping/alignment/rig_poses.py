@@ -6,7 +6,8 @@ from itertools import combinations
 
 from spherloc.errors import InputError
 from spherloc.geometry import camera_centre, pose, rotation_angle
-from spherloc.mapping.alignment.rig_scale import FixedImages, scale_by_rig
+from spherloc.mapping.alignment.fixed_images import FixedImages
+from spherloc.mapping.alignment.rig_scale import scale_by_rig
 from spherloc.mapping.rig import TURNED_RAD
 from spherloc.types import FloatArray
 

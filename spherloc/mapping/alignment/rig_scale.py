@@ -10,43 +10,22 @@ each other otherwise than they are fixed, it has them shifted, too: by the cross
 points are that they see. This lever is fitted with the scale, as else a tenth of a degree may falsify it by per cents.
 """
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from spherloc.cameras.base import Camera
-from spherloc.cameras.calibration import load_camera
-from spherloc.cameras.rig_files import RigCalibration, read_rig
-from spherloc.cameras.scaling import scaled
-from spherloc.datasets.asl_layout import asl_sequence, camera_of_folder
-from spherloc.datasets.query_gravity import time_of
-from spherloc.errors import CalibrationError, InputError, shorten
-from spherloc.files import is_folder
-from spherloc.frontend.view import View
+from spherloc.errors import InputError
 from spherloc.geometry import camera_centre
 from spherloc.mapping.advice import advice
+from spherloc.mapping.alignment.fixed_images import MIN_BASELINE_M, MIN_TIMES, FixedImages
 from spherloc.mapping.alignment.positions import MAX_SCALE_SD, NEAR_SD
-from spherloc.mapping.alignment.sequence import shots_of_sequence
 from spherloc.mapping.alignment.upright import MapScale
-from spherloc.mapping.images.found_calibrations import (
-    CALLED_CALIBRATION,
-    calibration_files,
-    own_files,
-)
-from spherloc.mapping.images.lens import for_colmap
-from spherloc.mapping.images.photographs import is_called
-from spherloc.mapping.rig import TURNED_RAD, Key, camera_and_key, taken_together
+from spherloc.mapping.rig import TURNED_RAD
 from spherloc.types import FloatArray
 
-MIN_TIMES = 3
-"""Least number of times at which two cameras took images together."""
-MIN_BASELINE_M = 1e-3
-"""Cameras that are closer do not tell a scale."""
+NONE = "{}, which says how the cameras are fixed to each other, gave no scale"
 MAX_BASELINE_M = 20.0
 """Cameras that are fixed to each other are not farther apart: such numbers are of other units."""
 PER_SD = 1.54
@@ -63,164 +42,17 @@ ROUNDS = 10
 """Number of times that the scale is fitted to what fits it."""
 
 
-@dataclass(frozen=True, eq=False)
-class FixedImages:
-    """Images of cameras that are fixed to each other, as a calibration says."""
-
-    source: str
-    """The calibration, in a word."""
-    body_from_camera: Mapping[str, FloatArray]
-    """(4, 4), metres, by the name of the image."""
-    times: Mapping[int, Sequence[str]]
-    """Names of the images that were taken together, those of one camera first, by a number of their time; none if it is
-    not known which these are."""
-
-
-def fixed_images(folder: Path, views: Sequence[View], given: Path | None) -> tuple[FixedImages | None, list[str]]:
-    """How the cameras of ``views``, photographs in ``folder``, are fixed to each other, None if no calibration says it
-    or if the images are of one camera; and remarks on what cannot be used.
-
-    The calibration is ``given``, a file or a folder of them, else that of a sequence in the ASL layout, else one of
-    each image, else a file in ``folder``.
-    """
-    sequence = None if given is not None else asl_sequence(folder)
-    if sequence is not None:
-        placed, files = {}, set[str]()
-        for shot in shots_of_sequence(sequence, views):
-            if shot.calibrated is not None and shot.calibrated.body_from_camera is not None:
-                placed[shot.name] = (shot.camera, shot.calibrated.body_from_camera)
-                files.add(sequence.called(shot.calibrated.file))
-        return _together(views, placed, " and ".join(sorted(files))), []
-    file = given if given is not None and not is_folder(given) else None
-    placed, remarks = _placed_by_own_files(views, given) if file is None else ({}, [])
-    if placed:
-        several = len({camera for camera, _ in placed.values()}) > 1
-        return _together(views, placed, "the calibration of each image") if several else None, remarks
-    alone: dict[str, FloatArray] = {}  # of files with one camera, by their names, fixed to the same body
-    for path in calibration_files(given or folder, ()) if file is None else [file]:
-        try:
-            rig = read_rig(path)
-        except CalibrationError as error:  # beside the photographs may lie anything
-            if file is not None or CALLED_CALIBRATION.search(path.stem.lower()):
-                remarks.append(f"{error} It is not used for the scale.")
-            continue
-        if len(rig.body_from_camera) > 1 and (found := _together(views, _placed(path, rig, views), shorten(path.name))):
-            return found, remarks
-        if len(rig.body_from_camera) == 1:
-            (alone[path.stem],) = rig.body_from_camera.values()
-    placed = {}
-    for view in views:
-        if called := sorted((name for name in alone if _says(view.name, name)), key=len)[-1:]:
-            placed[view.name] = (called[0], alone[called[0]])
-    files = sorted({camera for camera, _ in placed.values()})
-    if len(files) > 1:
-        return _together(views, placed, f"the calibration of {' and of '.join(map(shorten, files))}"), remarks
-    return None, remarks
-
-
-def _placed_by_own_files(
-    views: Sequence[View], given: Path | None
-) -> tuple[dict[str, tuple[str, FloatArray]], list[str]]:
-    """The camera's name and ``body_from_camera`` (4, 4) of the images whose own calibrations say it, in the folder
-    ``given`` if there is one, and the first remark on those that cannot be used."""
-    folders: dict[Path, dict[str, str]] = {}
-    for view in views:
-        folders.setdefault(view.path.parent, {})[view.path.name] = view.name
-    placed: dict[str, tuple[str, FloatArray]] = {}
-    remarks: list[str] = []
-    for folder, names in folders.items():
-        for image, path in own_files(folder, list(names), given).items():
-            try:
-                rig = read_rig(path).body_from_camera
-            except CalibrationError as error:
-                remarks.append(f"{error} It is not used for the scale.")
-                continue
-            if len(rig) == 1:
-                ((camera, matrix),) = rig.items()
-                placed[names[image]] = (camera or camera_and_key(image)[0], matrix)
-    return placed, remarks[:1] if placed else []
-
-
-def _placed(path: Path, rig: RigCalibration, views: Sequence[View]) -> dict[str, tuple[str, FloatArray]]:
-    """The camera's name and ``body_from_camera`` (4, 4) of the images that have one of a file's cameras; where several
-    have the same lens, the one whose name is in that of the image or of its folder."""
-    names: dict[str, list[str]] = {}
-    for size in {(view.camera.width, view.camera.height) for view in views}:
-        for name in rig.body_from_camera:
-            camera = _for_images(path, name, size)
-            if camera is not None:
-                names.setdefault(repr(camera), []).append(name)
-    found = {}
-    for view in views:
-        called = names.get(repr(view.camera), [])
-        if len(called) > 1:
-            called = sorted((name for name in called if _says(view.name, name)), key=len)[-1:]
-        if len(called) == 1:
-            found[view.name] = (called[0], rig.body_from_camera[called[0]])
-    wrong = _of_several(found)
-    return {name: one for name, one in found.items() if name not in wrong}
-
-
-def _of_several(placed: Mapping[str, tuple[str, FloatArray]]) -> set[str]:
-    """Names of images that have the camera of images which, by their names, another camera took: at most one of the two
-    is that camera, the one that is called so."""
-    takers: dict[str, dict[str, list[str]]] = {}
-    for image, (camera, _) in placed.items():
-        takers.setdefault(camera, {}).setdefault(camera_and_key(image)[0], []).append(image)
-    wrong = set[str]()
-    for camera, images in takers.items():
-        if sum(len(names) >= MIN_TIMES for names in images.values()) > 1:
-            wrong |= {name for names in images.values() for name in names if not _says(name, camera)}
-    return wrong
-
-
-def _says(image: str, camera: str) -> bool:
-    """Whether the name of an image, or that of its folder, has that of a camera."""
-    return is_called(camera, image) or camera_of_folder(Path(image).parent) == camera
-
-
-def _for_images(path: Path, name: str, size: tuple[int, int]) -> Camera | None:
-    """A camera of a file as photographs of a size have it; None if they cannot have it."""
-    try:
-        camera: Camera | None = load_camera(path, name, size)
-        if camera is not None and (camera.width, camera.height) != size:
-            camera = scaled(camera, *size)
-        return None if camera is None else for_colmap(camera)[0]
-    except CalibrationError:
-        return None
-
-
-def _together(views: Sequence[View], placed: Mapping[str, tuple[str, FloatArray]], source: str) -> FixedImages | None:
-    """The images that were taken together, of those with a camera's name and ``body_from_camera`` (4, 4)."""
-    keys: dict[str, dict[str, Key]] = {}
-    for view in views:
-        if view.name in placed:
-            keys.setdefault(placed[view.name][0], {})[view.name] = camera_and_key(view.name, time_of(view))[1]
-    times: dict[int, list[str]] = {}
-    for name, (_, step) in sorted(taken_together(keys, MIN_TIMES).items()):
-        times.setdefault(step, []).append(name)
-    times = {step: names for step, names in times.items() if len(names) > 1}
-    if not times and len(_takers(views)) < 2:
-        return None
-    bodies = {name: placed[name][1] for names in times.values() for name in names}
-    return FixedImages(source, bodies, times)
-
-
-def _takers(views: Sequence[View]) -> set[str]:
-    """The cameras that took two images or more each, by their names."""
-    images = Counter(camera_and_key(view.name)[0] for view in views)
-    return {camera for camera, count in images.items() if count > 1}
-
-
 def scale_by_rig(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScale:
     """The scale at which images that were taken together are as far apart as their cameras.
 
     ``poses`` (3, 4) are those of the map, by name. Raises ``InputError`` if there are too few such images in it, or if
     these do not fix the scale to ``MAX_SCALE_SD``.
     """
+    if fixed.one_time:
+        return _scale_of_one_time(poses, fixed)
     times = [[name for name in names if name in poses] for names in fixed.times.values()]
     times = [names for names in times if len(names) > 1]
-    none = f"{fixed.source}, which says how the cameras are fixed to each other, gave no scale"
+    none = NONE.format(fixed.source)
     if len(times) < MIN_TIMES:
         if len(fixed.times) < MIN_TIMES:
             told = "as far as names of images and folders tell its cameras, and numbers or times in them the moment"
@@ -231,27 +63,58 @@ def scale_by_rig(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScal
     stated, mapped, turns = (np.array([one[k] for one in between]) for k in range(3))
     turned_rad = np.linalg.norm(turns, axis=1)
     lengths_m = np.linalg.norm(stated, axis=1)
-    if lengths_m.max() > MAX_BASELINE_M:
-        metres = "give the positions in its transforms in metres, not in millimetres"
-        raise InputError(f"{none}: it says that cameras are {lengths_m.max():.0f} m apart; {metres}.")
+    _check_metres(none, lengths_m)
     alike = (turned_rad <= TURNED_RAD) & (lengths_m > MIN_BASELINE_M)
     if 2 * np.count_nonzero(alike) < len(alike):
-        off_deg = np.degrees(np.median(turned_rad))
-        otherwise = f"in the map the cameras are turned against each other {off_deg:.0f}° otherwise than it says"
-        raise InputError(f"{none}: {otherwise}, or it has them in one place; {advice('other scale')}.")
+        raise InputError(_otherwise(none, turned_rad))
     stated, mapped, turns = stated[alike], mapped[alike], turns[alike]
     units, scattered, steady = _units_per_metre(stated, mapped, turns if len(times) >= MIN_FOR_LEVER else None)
     # Of three images that were taken together the third distance tells nothing new, and few times tell little.
     free = sum(len(names) - 1 for names in times)
     relative = float(np.sqrt(len(pairs) / free)) * max(scattered * (1.0 + 5.0 / (len(times) - 1)), steady)
-    lengths_m = np.linalg.norm(stated, axis=1)
-    shortest, longest = (f"{length_m:.2g}" for length_m in (lengths_m.min(), lengths_m.max()))
-    apart = f"{shortest} m" if shortest == longest else f"{shortest} to {longest} m"
+    apart = _range_m(np.linalg.norm(stated, axis=1))
     seen = f"images that cameras {apart} apart took together, at {len(times)} times"
     if not relative <= MAX_SCALE_SD:
         off = f"uncertain by {relative:.0%}" if relative < MAX_OFF else "not known"
         raise InputError(f"{none}: by {seen}, the scale is {off}; {advice('other scale')}.")
     return MapScale(1.0 / units, f"{fixed.source}: {seen}; the scale is good to {max(relative, 5e-4):.1%}")
+
+
+def _scale_of_one_time(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScale:
+    """The scale of a map of images of one time, which has them as the calibration does, but for a factor.
+
+    Raises ``InputError`` if it has them otherwise, or fewer than two.
+    """
+    none = NONE.format(fixed.source)
+    inside = [name for name in fixed.body_from_camera if name in poses]
+    if len(inside) < 2:
+        raise InputError(f"{none}: fewer than two of its images are in the map.")
+    between = [_between(poses, fixed.body_from_camera, pair) for pair in combinations(inside, 2)]
+    stated_m, mapped, turned_rad = (np.array([np.linalg.norm(one[k]) for one in between]) for k in range(3))
+    _check_metres(none, stated_m)
+    if stated_m.max() <= MIN_BASELINE_M or np.median(turned_rad) > TURNED_RAD:
+        raise InputError(_otherwise(none, turned_rad))
+    source = f"{fixed.source}, which places the images of a single time: {_range_m(stated_m)} apart"
+    return MapScale(float(stated_m.sum() / mapped.sum()), source)
+
+
+def _otherwise(none: str, turned_rad: FloatArray) -> str:
+    """That a map and the calibration disagree, a sentence that starts with ``none``."""
+    off_deg = np.degrees(np.median(turned_rad))
+    otherwise = f"in the map the cameras are turned against each other {off_deg:.0f}° otherwise than it says"
+    return f"{none}: {otherwise}, or it has them in one place; {advice('other scale')}."
+
+
+def _check_metres(none: str, lengths_m: FloatArray) -> None:
+    """Raises ``InputError``, a sentence that starts with ``none``, if distances (K,) of cameras cannot be metres."""
+    if lengths_m.max() > MAX_BASELINE_M:
+        metres = "give the positions in its transforms in metres, not in millimetres"
+        raise InputError(f"{none}: it says that cameras are {lengths_m.max():.0f} m apart; {metres}.")
+
+
+def _range_m(lengths_m: FloatArray) -> str:
+    shortest, longest = (f"{length_m:.2g}" for length_m in (lengths_m.min(), lengths_m.max()))
+    return f"{shortest} m" if shortest == longest else f"{shortest} to {longest} m"
 
 
 def doubt_of_scale(poses: Mapping[str, FloatArray], scale: MapScale, fixed: FixedImages) -> str:

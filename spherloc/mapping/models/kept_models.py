@@ -20,6 +20,7 @@ from spherloc.files import is_file, names_in, open_file, read_file
 from spherloc.frontend.features import VERSION
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
+from spherloc.mapping.alignment.fixed_images import FixedImages
 from spherloc.mapping.models.model import Reconstruction
 from spherloc.mapping.rig import shots_of
 from spherloc.registry import require
@@ -36,15 +37,16 @@ def kept_or_made(
     gravity: Sequence[Gravity | None],
     folder: Path,
     how: FrontendOptions,
+    fixed: FixedImages | None,
     make: Callable[[], tuple[Reconstruction, ...]],
 ) -> tuple[Reconstruction, ...]:
-    """The models that ``make`` makes of ``views`` with their ``gravity``; those that ``folder`` keeps if they were made
-    of the same.
+    """The models that ``make`` makes of ``views`` with their ``gravity`` and what says how their cameras are ``fixed``;
+    those that ``folder`` keeps if they were made of the same.
 
     Models that were just made are read back from the file, so that a map is the same either way. If they cannot be
     written, nothing is kept. Raises what ``make`` raises.
     """
-    key = _key(views, gravity, how)
+    key = _key(views, gravity, how, fixed)
     kept = _read(folder, key)
     if kept is not None:
         return kept
@@ -59,7 +61,9 @@ def forget(folder: Path) -> None:
         (folder / FILE).unlink()
 
 
-def _key(views: Sequence[View], gravity: Sequence[Gravity | None], how: FrontendOptions) -> str:
+def _key(
+    views: Sequence[View], gravity: Sequence[Gravity | None], how: FrontendOptions, fixed: FixedImages | None
+) -> str:
     """Hash of all on which the models depend."""
     pycolmap = require("pycolmap", "colmap", "making a map")
     parts: list[object] = [VERSION, pycolmap.__version__, how]
@@ -72,6 +76,9 @@ def _key(views: Sequence[View], gravity: Sequence[Gravity | None], how: Frontend
         if down is not None:
             parts += [down.down.tobytes(), down.source, down.bound_rad, down.sd_rad, down.by_map]
         parts.append(None)
+    if fixed is not None:
+        parts += [sorted(fixed.times.items())]
+        parts += [part for name, matrix in sorted(fixed.body_from_camera.items()) for part in (name, matrix.tobytes())]
     return key_of(*parts, sorted(shots_of(views).items()))
 
 

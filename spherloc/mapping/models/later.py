@@ -18,8 +18,8 @@ from spherloc.errors import ProblemError
 from spherloc.estimators import default_options, estimate
 from spherloc.frontend.view import Gravity, View
 from spherloc.geometry import DOWN, transform
+from spherloc.mapping.alignment.fixed_images import FixedImages
 from spherloc.mapping.alignment.rig_poses import expected_by_calibration
-from spherloc.mapping.alignment.rig_scale import FixedImages
 from spherloc.mapping.alignment.upright import Level, arbitrary_scale
 from spherloc.mapping.models.model import Reconstruction, SeenPoints, contradictions, points_of
 from spherloc.mapping.parallel import Tell
@@ -157,14 +157,15 @@ def _undoubted(made: Reconstruction, names: Sequence[str], name: str, placed: _P
     return not any(name in pair for pair in contradictions(poses, names, made.all_matches, points))
 
 
-def with_images(made: Reconstruction, poses: Mapping[str, FloatArray]) -> Reconstruction:
-    """The map with images of these poses (3, 4) in its frame, after another triangulation and bundle adjustment."""
+def with_images(made: Reconstruction, poses: Mapping[str, FloatArray], adjust: bool = True) -> Reconstruction:
+    """The map with images of these poses (3, 4) in its frame, after another triangulation and, with ``adjust``, bundle
+    adjustment."""
     none = np.empty(0, np.int64)
-    return _with(made, {name: _Placed(pose, none, none) for name, pose in poses.items()})
+    return _with(made, {name: _Placed(pose, none, none) for name, pose in poses.items()}, adjust)
 
 
-def _with(made: Reconstruction, placed: Mapping[str, _Placed]) -> Reconstruction:
-    """The map with more images, after another triangulation and bundle adjustment."""
+def _with(made: Reconstruction, placed: Mapping[str, _Placed], adjust: bool = True) -> Reconstruction:
+    """The map with more images, as ``with_images``."""
     pycolmap = require("pycolmap", "colmap", "making a map")
     model = made.model
     for name, one in placed.items():
@@ -180,7 +181,8 @@ def _with(made: Reconstruction, placed: Mapping[str, _Placed]) -> Reconstruction
         model = pycolmap.triangulate_points(
             model, str(made.database), folder, folder, clear_points=False, options=options, refine_intrinsics=False
         )
-    adjusted(pycolmap, model)
+    if adjust:
+        adjusted(pycolmap, model)
     poses = {
         image.name: np.asarray(image.cam_from_world().matrix())
         for image in (model.image(number) for number in model.reg_image_ids())

@@ -27,7 +27,9 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import InputError
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
+from spherloc.mapping.alignment.fixed_images import FixedImages
 from spherloc.mapping.alignment.upright import level_of
+from spherloc.mapping.models.fixed_views import fixed_pairs, placed_by_calibration
 from spherloc.mapping.models.joining import joined_by_pairs
 from spherloc.mapping.models.later import with_images
 from spherloc.mapping.models.misplaced import fits, without_misplaced
@@ -64,19 +66,26 @@ def reconstruct(
     folder: Path,
     tell: Tell,
     how: FrontendOptions | None = None,
+    fixed: FixedImages | None = None,
 ) -> tuple[Reconstruction, ...]:
     """Map images of one camera or several; the database in ``folder`` is kept, and what it has is used again.
 
     The map with most images comes first, then maps of other images that could not be joined with it.
 
     ``gravity`` is that from the images' vertical lines, ``how`` the features and their matching, SIFT if it is None.
+    ``fixed`` says how their cameras are fixed to each other; of images of one time it places them.
 
     Raises ``InputError`` if pycolmap is missing, if an image or the folder cannot be used, or if no two images fit
     together, and ``StoppedError`` if there is no room for the database.
     """
     pycolmap = require("pycolmap", "colmap", "making a map")
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # errors are reported here instead
-    matched = match_all(pycolmap, views, gravity, folder, tell, how or FrontendOptions())
+    together = fixed_pairs(views, fixed)
+    matched = match_all(pycolmap, views, gravity, folder, tell, how or FrontendOptions(), together)
+    if fixed is not None and fixed.one_time:
+        placed = placed_by_calibration(pycolmap, matched, fixed)
+        if placed is not None:
+            return (placed,)
     panoramas = all(isinstance(view.camera, Equirectangular) for view in views)
     shots, left = shots_of(views), matched
     known = {view.name: one for view, one in zip(views, gravity, strict=True) if one is not None}

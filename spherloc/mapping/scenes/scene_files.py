@@ -66,8 +66,8 @@ class MapHead:
         return replace(self, sections=tuple(lines))
 
 
-def scene_text(head: MapHead, names: Sequence[str]) -> str:
-    """The scene whose queries are some of the map's own images, of which ``names`` are all."""
+def scene_text(head: MapHead, queries: Sequence[str]) -> str:
+    """The scene whose queries are some of the map's own images."""
     lines = [
         'kind = "colmap"',
         f"name = {toml_text(head.name)}",
@@ -76,7 +76,7 @@ def scene_text(head: MapHead, names: Sequence[str]) -> str:
         f"images = {toml_text(head.images)}",
         head.units,
         "# Localized against the other images; those of the map that you name here are left out of it.",
-        f"queries = {_names(own_queries(names))}",
+        f"queries = {_names(queries)}",
         *head.sections,
     ]
     return "\n".join(lines) + "\n"

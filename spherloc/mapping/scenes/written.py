@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from spherloc.mapping.advice import advice
 from spherloc.mapping.alignment.stated_gravity import StatedGravity
 from spherloc.mapping.alignment.true_poses import AlignedTruth, aligned_truth
 from spherloc.mapping.alignment.upright import Level, MapScale, upright_frame
-from spherloc.mapping.models.model import Reconstruction
+from spherloc.mapping.models.model import Reconstruction, registered
 from spherloc.mapping.scenes.new_images import NewImages
 from spherloc.mapping.scenes.scene_files import (
     GRAVITY,
@@ -24,12 +25,14 @@ from spherloc.mapping.scenes.scene_files import (
     UNITS_UNKNOWN,
     MapHead,
     new_scene_text,
+    own_queries,
     relative,
     scene_text,
     toml_text,
     write_gravity,
     write_new_scene,
 )
+from spherloc.mapping.two_view.pairs import MIN_MATCHES
 from spherloc.registry import require
 from spherloc.types import FloatArray
 
@@ -106,8 +109,9 @@ def write_map(
                 folder / GRAVITY, {name: kept.gravity.found[name] for name in names if name in kept.gravity.found}
             )
             own_head = head.with_gravity(GRAVITY)
-        if len(names) >= MIN_WITHOUT:
-            content = scene_text(own_head, names)
+        queries = _leavable(made.model, own_queries(names)) if len(names) >= MIN_WITHOUT else []
+        if queries:
+            content = scene_text(own_head, queries)
         else:
             own = NewImages(images, tuple(view for view in views if view.name in poses))
             content = new_scene_text(own_head, folder, own, views[0].camera)
@@ -119,6 +123,16 @@ def write_map(
     except (OSError, RuntimeError) as error:
         raise StoppedError(f"{folder}: cannot be written ({reason(error)}); {advice('go on')}.") from None
     return Written(scene, new_scene, poses, made.points(), float(made.model.compute_mean_reprojection_error()), truth)
+
+
+def _leavable(model: Any, queries: Sequence[str]) -> list[str]:
+    """Those of the images ``queries`` of a model that see enough of the points that it has without them: of cameras
+    that look to all sides at a single moment, hardly a point is seen by three."""
+    ids = {image.name: image.image_id for image in registered(model)}
+    without = set(ids.values()) - {ids[name] for name in queries}
+    tracks = [{one.image_id for one in point.track.elements} for point in model.points3D.values()]
+    left = [track for track in tracks if len(track & without) > 1]
+    return [name for name in queries if sum(ids[name] in track for track in left) >= MIN_MATCHES]
 
 
 def _about(made: Reconstruction, level: Level, scale: MapScale, count: int) -> str:

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from spherloc.mapping.parallel import Tell, as_completed
 from spherloc.mapping.rig import shots_of
 from spherloc.mapping.two_view.pairs import MIN_MATCHES, SURE, ImagePairs, relative
 from spherloc.mapping.two_view.rotations import agreeing
-from spherloc.mapping.two_view.triangles import Pair, open_triangles
+from spherloc.mapping.two_view.triangles import Pair, Relative, open_triangles
 from spherloc.registry import require
 from spherloc.types import BoolArray, FloatArray
 
@@ -122,10 +123,11 @@ def match_all(
     folder: Path,
     tell: Tell,
     how: FrontendOptions,
+    fixed: Mapping[Pair, Relative] = MappingProxyType({}),
 ) -> Matched:
     """Features and matches of images, of which those that a database in ``folder`` has are used again.
 
-    ``gravity`` is that from the images' vertical lines.
+    ``gravity`` is that from the images' vertical lines, ``fixed`` the relative poses of pairs that a calibration tells.
 
     Raises ``InputError`` if an image or the folder cannot be used, or if no two images fit together, and
     ``StoppedError`` if there is no room for the database.
@@ -136,14 +138,16 @@ def match_all(
         tell("images searched for features", len(extracted), len(views))
     features = [extracted[index] for index in range(len(views))]
     usable = [_usable(view.camera, one.pixels) for view, one in zip(views, features, strict=True)]
-    path = folder / f"matches_{_key(views, how)}.db"
+    path = folder / f"matches_{_key(views, how, fixed)}.db"
     with _database(pycolmap, path) as database:
         ids = _described(pycolmap, database, views, features, usable)
         cameras = [view.camera for view in views]
         promising = _pairs(features, NEIGHBOURS_LEARNED, ALIKE_LEARNED) if len(how.features.parts) > 1 else ()
-        compared = ImagePairs(pycolmap, cameras, features, usable, gravity, how.matching, frozenset(promising))
+        compared = ImagePairs(pycolmap, cameras, features, usable, gravity, how.matching, frozenset(promising), fixed)
         every = len(views) <= MAX_EXHAUSTIVE
-        pairs = list(combinations(range(len(views)), 2)) if every else _pairs(features, NEIGHBOURS, ALIKE)
+        pairs = list(combinations(range(len(views)), 2))
+        if not every:
+            pairs = sorted({*_pairs(features, NEIGHBOURS, ALIKE), *fixed})
         found, at_one_place, sureness = _compared(database, ids, compared, pairs, tell)
     whole = path.with_name(f"{path.stem}_whole.db")
     try:
@@ -230,14 +234,15 @@ def _database(pycolmap: Any, path: Path) -> Iterator[Any]:
         raise StoppedError(f"{path}: cannot be written ({reason(error)}); {advice('go on')}.") from None
 
 
-def _key(views: Sequence[View], how: FrontendOptions) -> str:
+def _key(views: Sequence[View], how: FrontendOptions, fixed: Mapping[Pair, Relative]) -> str:
     """Hash of the images and of all that their matches depend on; it names the database."""
-    said = [DATABASE_VERSION, VERSION, how.features.method, how.matching.method]
+    said: list[object] = [DATABASE_VERSION, VERSION, how.features.method, how.matching.method]
     for view in views:
         status = view.path.stat()
         said += [view.name, status.st_size, status.st_mtime_ns, repr(view.camera)]
         if view.mask is not None:
             said.append(hashlib.sha256(np.packbits(view.usable_pixels()).tobytes()).hexdigest())
+    said += [[pair, *(one.tolist() for one in pose)] for pair, pose in sorted(fixed.items())]
     return hashlib.sha256(json.dumps(said).encode()).hexdigest()[:12]
 
 

@@ -9,6 +9,7 @@ Ambiguous matches that fit the pose are added afterwards.
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from math import pi, tau
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,8 @@ NOT_FAR = 3.0
 CLEARLY = 2.0
 """A pose is better than another if this many times as many of the matches that tell it fit; clouds may have made a pose
 if this many times as many of the matches above the horizon fit it as of the others."""
+SAME_RAD = 1e-6
+"""A pose that was written into a database and read again is the same to this angle."""
 MAX_LOG10_NFA = -1.0
 """Largest log10 of the NFA: the number of poses that as many of the matches would fit by chance."""
 
@@ -78,10 +81,12 @@ class ImagePairs:
         gravity: Sequence[Gravity | None],
         matching: MatchOptions,
         promising: Collection[Pair],
+        fixed: Mapping[Pair, Relative] = MappingProxyType({}),
     ) -> None:
         """``usable`` are the indices (K,) of each image's features for COLMAP, ``gravity`` that from vertical lines. Of
-        joined kinds of features all are matched in ``promising`` pairs, the first in others."""
-        self._matching, self._promising = matching, promising
+        joined kinds of features all are matched in ``promising`` pairs, the first in others. ``fixed`` are the relative
+        poses of pairs that a calibration tells."""
+        self._matching, self._promising, self._fixed = matching, promising, fixed
         self._cameras = cameras
         self._pycolmap = pycolmap
         self._features = features
@@ -118,7 +123,37 @@ class ImagePairs:
         kept = (pairs >= 0).all(axis=1)
         pairs = pairs[kept][np.argsort(found.ratios[kept], kind="stable")].astype(np.uint32)
         geometry = self._geometry(first, second, pairs)
-        return pairs, None if geometry is None else self._guided(first, second, geometry)
+        as_fixed = self._as_fixed(first, second, pairs, geometry)
+        if geometry is None or as_fixed is not None:
+            return pairs, as_fixed
+        return pairs, self._guided(first, second, geometry)
+
+    def _as_fixed(self, first: int, second: int, pairs: NDArray[np.uint32], found: Any) -> Any:
+        """A ``TwoViewGeometry`` with the pose that a calibration tells of the pair; None if it tells none, if no more
+        of the matches (M, 2) fit it than wrong ones would, or if clearly more of them fit the one that was ``found``
+        by them."""
+        if (first, second) not in self._fixed or len(pairs) < MIN_MATCHES:
+            return None
+        pose = self._fixed[first, second]
+        rays = self._rays(first, second, pairs)
+        fits = int(np.count_nonzero(fitting(*rays, *pose, self.bound_rad)))
+        if found is not None and self._support(found, *rays) > CLEARLY * fits:
+            return None
+        if log10_nfa(len(pairs), fits, chance_of_fit(*rays, *pose, self.bound_rad), sample=0) > MAX_LOG10_NFA:
+            return None
+        rays, words = (self.bearings[first], self.bearings[second]), (self._words[first], self._words[second])
+        more = guided_matches(rays, words, *pose, self.bound_rad)
+        if len(more) < MIN_MATCHES:
+            return None
+        geometry = self._pycolmap.TwoViewGeometry()
+        geometry.config = self._pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+        geometry.cam2_from_cam1 = self._pycolmap.Rigid3d(np.column_stack(pose))
+        geometry.inlier_matches = more
+        return geometry
+
+    def is_as_fixed(self, pair: Pair, geometry: Any) -> bool:
+        """Whether the pose of a pair is the one that a calibration tells."""
+        return pair in self._fixed and rotation_angle(relative(geometry)[0] @ self._fixed[pair][0].T) <= SAME_RAD
 
     def _matches(self, first: int, second: int) -> FeatureMatches:
         one, other = self._features[first], self._features[second]
@@ -157,10 +192,12 @@ class ImagePairs:
     def sureness(self, first: int, second: int, pairs: NDArray[np.uint32], geometry: Any) -> float:
         """How sure a pose is; it should be ``SURE``.
 
-        Of panoramas 0 or infinity: whether what fits of the matches (M, 2) may be a thing that stands at two places, or
-        a place that looks alike. Of others the number of those that fit, times the cube of the peak, or times what
-        makes ``MANY_SURE`` sure.
+        Infinity if a calibration tells it. Of panoramas 0 or infinity: whether what fits of the matches (M, 2) may be a
+        thing that stands at two places, or a place that looks alike. Of others the number of those that fit, times the
+        cube of the peak, or times what makes ``MANY_SURE`` sure.
         """
+        if self.is_as_fixed((first, second), geometry):
+            return np.inf
         rays, pose = self._rays(first, second, pairs), relative(geometry)
         fits = fitting(*rays, *pose, self.bound_rad)
         count, cameras = np.count_nonzero(fits), (self._cameras[first], self._cameras[second])

@@ -1,0 +1,103 @@
+"""Images of a single moment: a map in which the calibration of the cameras is all that places them."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from test_own_calibrations import CAMERAS, as_woodscape
+
+from spherloc.cameras.calibration import load_camera
+from spherloc.datasets import load_scene
+from spherloc.geometry import camera_centre, inverse_pose, pose, rotation_angle, transform
+from spherloc.mapping.alignment.fixed_images import fixed_images
+from spherloc.mapping.images.photographs import photographs
+from spherloc.mapping.make import make_map
+from spherloc.mapping.request import MapRequest, ScaleMeasurement
+from spherloc.worlds import build_world
+from spherloc.worlds.render import draw
+
+SIZE = 512, 384
+
+
+def calibration(name):
+    """Of a camera of a car that looks down by 20 degrees."""
+    document = as_woodscape(name, 136.0, SIZE)
+    turn = Rotation.from_quat(document["extrinsic"]["quaternion"]) * Rotation.from_euler("x", -20.0, degrees=True)
+    document["extrinsic"]["quaternion"] = turn.as_quat().tolist()
+    document["extrinsic"]["translation"][1] = {"MVL": 0.95, "MVR": -0.95}.get(name, 0.0)
+    return document
+
+
+@pytest.fixture(scope="module")
+def car(tmp_path_factory):
+    """A folder with the images of a car's four cameras at one moment and their calibrations, the true poses and the
+    distance of what each pixel shows, m."""
+    folder = tmp_path_factory.mktemp("car") / "moment"
+    folder.mkdir()
+    world, poses, ranges = build_world("street", 3), {}, {}
+    start = world.route(10)[4]
+    ahead = start[2, :3] * [1.0, 1.0, 0.0]
+    ahead /= np.linalg.norm(ahead)
+    body = np.column_stack([ahead, np.cross([0.0, 0.0, 1.0], ahead), [0.0, 0.0, 1.0]])
+    for name in CAMERAS:
+        document = calibration(name)
+        path = folder / f"00007_{name}.json"
+        path.write_text(json.dumps(document))
+        extrinsic = document["extrinsic"]
+        turn = body @ Rotation.from_quat(extrinsic["quaternion"]).as_matrix()
+        centre = camera_centre(start) - [0.0, 0.0, 1.0] + body @ extrinsic["translation"]
+        cam_from_world = inverse_pose(pose(turn, centre))
+        drawn = draw(world, load_camera(path, None, SIZE), cam_from_world)
+        cv2.imwrite(str(path.with_suffix(".png")), drawn.image)
+        poses[f"00007_{name}.png"], ranges[f"00007_{name}.png"] = cam_from_world, drawn.range_m
+    return folder, poses, ranges
+
+
+def made_of(folder, target):
+    views = photographs(folder, {}).views
+    fixed, _ = fixed_images(folder, views, None)
+    return make_map(MapRequest(views, folder, ScaleMeasurement(fixed=fixed)), target), fixed
+
+
+def test_the_calibration_places_the_images_of_one_moment(car, tmp_path):
+    """In metres, where no three of them see a point; and each point is where the picture shows it."""
+    folder, poses, ranges = car
+    made, fixed = made_of(folder, tmp_path / "map")
+    assert fixed.one_time and made.scale.source.startswith("the calibration of each image, which places the images of")
+    assert set(made.written.poses) == set(poses)
+    names = sorted(poses)
+    for name in names[1:]:
+        relative, true = (
+            (one[name][:, :3] @ one[names[0]][:, :3].T, one[name] @ [*camera_centre(one[names[0]]), 1.0])
+            for one in (made.written.poses, poses)
+        )
+        assert rotation_angle(relative[0] @ true[0].T) < 1e-6
+        np.testing.assert_allclose(relative[1], true[1], atol=1e-6)
+        assert made.written.poses[name][:, 2] @ poses[name][:, 2] > np.cos(np.radians(1.0)), "up"
+    off = []
+    for image in made.made.model.images.values():
+        for seen in (one for one in image.points2D if one.has_point3D()):
+            point = made.made.model.point3D(seen.point3D_id).xyz
+            column, row = np.floor(seen.xy).astype(int)
+            distance = np.linalg.norm(transform(made.written.poses[image.name], point[None])[0])
+            off.append(distance / ranges[image.name][row, column] - 1.0)
+    assert len(off) > 600 and np.median(np.abs(off)) < 0.03 and np.mean(np.abs(off) < 0.1) > 0.7
+    scene = load_scene(made.written.scene)
+    assert [view.name for view in scene.queries] == names, "the map without one of them would not show it"
+
+
+def test_a_calibration_of_another_car_places_nothing(car, tmp_path):
+    """What looks ahead in this one looks to the left in that one."""
+    folder, poses, _ = car
+    wrong = tmp_path / "wrong"
+    shutil.copytree(folder, wrong)
+    order = list(CAMERAS)
+    for name, other in zip(order, (*order[2:], *order[:2]), strict=True):
+        (wrong / f"00007_{name}.json").write_text(json.dumps(calibration(other) | {"name": name}))
+    made, fixed = made_of(wrong, tmp_path / "map")
+    assert fixed.one_time and not made.scale.source
+    assert "turned against each other" in made.scale.why_unknown and "otherwise than it says" in made.scale.why_unknown
+    assert len(made.written.poses) < len(poses)
