@@ -27,7 +27,8 @@ from spherloc.errors import InputError
 from spherloc.files import is_image, names_in
 from spherloc.geometry import camera_centre
 from spherloc.images import read_image
-from spherloc.mapping.images.photographs import CalibratedLens, photographs
+from spherloc.mapping.images.folder_cameras import CalibratedLens
+from spherloc.mapping.images.photographs import photographs
 from spherloc.mapping.images.unknown_lens import find_lens
 from spherloc.mapping.make import make_map
 from spherloc.mapping.request import MapRequest

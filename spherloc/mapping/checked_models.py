@@ -15,7 +15,7 @@ from spherloc.frontend.view import View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.alignment.line_gravity import GravityByLines, gravity_by_lines
 from spherloc.mapping.images.carried import carried_nadir_deg
-from spherloc.mapping.images.photographs import CalibratedLens
+from spherloc.mapping.images.folder_cameras import CalibratedLens
 from spherloc.mapping.models.kept_models import kept_or_made
 from spherloc.mapping.models.lens_in_map import lens_in_map
 from spherloc.mapping.models.model import Reconstruction

@@ -25,7 +25,7 @@ from spherloc.mapping.alignment.upright import (
     scale_by_positions,
 )
 from spherloc.mapping.checked_models import checked_models
-from spherloc.mapping.images.photographs import CalibratedLens
+from spherloc.mapping.images.folder_cameras import CalibratedLens
 from spherloc.mapping.models.kept_models import forget
 from spherloc.mapping.models.later import place_rest
 from spherloc.mapping.models.misplaced import far_off

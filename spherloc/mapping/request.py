@@ -10,7 +10,7 @@ from spherloc.frontend.view import View
 from spherloc.mapping.alignment.fixed_images import FixedImages
 from spherloc.mapping.alignment.positions import Positions
 from spherloc.mapping.alignment.stated_gravity import StatedGravity
-from spherloc.mapping.images.photographs import CalibratedLens
+from spherloc.mapping.images.folder_cameras import CalibratedLens
 from spherloc.mapping.scenes.new_images import NewImages
 
 

@@ -38,16 +38,11 @@ from spherloc.mapping.alignment.sequence import sequence_data
 from spherloc.mapping.alignment.stated_gravity import read_stated_gravity
 from spherloc.mapping.alignment.tag_gravity import stated_by_tags
 from spherloc.mapping.alignment.true_poses import truth_words
+from spherloc.mapping.images.folder_cameras import CalibratedLens, LensFinder
 from spherloc.mapping.images.found_calibrations import calibrations_in
 from spherloc.mapping.images.frames import FRAMES, FrameChoice, frames_of
 from spherloc.mapping.images.given_cameras import given_cameras
-from spherloc.mapping.images.photographs import (
-    CalibratedLens,
-    LensFinder,
-    Photographs,
-    cameras_of,
-    photographs,
-)
+from spherloc.mapping.images.photographs import Photographs, cameras_of, photographs
 from spherloc.mapping.kept_scale import FILE as SCALE_FILE
 from spherloc.mapping.kept_scale import keep_scale, kept_scale
 from spherloc.mapping.make import Map, make_map

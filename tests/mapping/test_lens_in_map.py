@@ -14,7 +14,7 @@ from spherloc.errors import InputError, StoppedError
 from spherloc.frontend.view import View
 from spherloc.geometry import so3_exp
 from spherloc.mapping import checked_models as checks
-from spherloc.mapping.images.photographs import CalibratedLens
+from spherloc.mapping.images.folder_cameras import CalibratedLens
 from spherloc.mapping.models.lens_in_map import LensInMap, lens_in_map
 from spherloc.mapping.models.model import Reconstruction
 from spherloc.mapping.request import MapRequest

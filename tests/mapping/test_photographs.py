@@ -18,11 +18,12 @@ from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.cameras.mei import Mei
 from spherloc.errors import CalibrationError, InputError
 from spherloc.frontend.view import View
+from spherloc.mapping.images.folder_cameras import is_called
 from spherloc.mapping.images.frames import frames_of
 from spherloc.mapping.images.full_panorama import two_circles
 from spherloc.mapping.images.given_cameras import given_cameras
 from spherloc.mapping.images.lens import for_colmap
-from spherloc.mapping.images.photographs import Photographs, is_called, photographs
+from spherloc.mapping.images.photographs import Photographs, photographs
 from spherloc.mapping.scenes.new_images import new_images_of
 from spherloc.mapping.scenes.scene_files import (
     SCENE,

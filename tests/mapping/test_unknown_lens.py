@@ -16,9 +16,10 @@ from spherloc.errors import InputError
 from spherloc.frontend.view import View
 from spherloc.geometry import so3_exp
 from spherloc.mapping.images import lens_fit, unknown_lens
+from spherloc.mapping.images.folder_cameras import CalibratedLens
 from spherloc.mapping.images.image_circle import image_circle
 from spherloc.mapping.images.lens_fit import Circle, RadialLens, fit_lens
-from spherloc.mapping.images.photographs import CalibratedLens, Photographs, photographs
+from spherloc.mapping.images.photographs import Photographs, photographs
 from spherloc.mapping.images.unknown_lens import MAX_OFF_RAD, find_lens
 from spherloc.mapping.scenes.scene_files import LENS, lenses_given, write_lenses
 from spherloc_viz.commands.map import _lens_finder, _lens_told

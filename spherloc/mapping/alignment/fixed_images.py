@@ -16,13 +16,13 @@ from spherloc.errors import CalibrationError, shorten
 from spherloc.files import is_folder
 from spherloc.frontend.view import View
 from spherloc.mapping.alignment.sequence import shots_of_sequence
+from spherloc.mapping.images.folder_cameras import is_called
 from spherloc.mapping.images.found_calibrations import (
     CALLED_CALIBRATION,
     calibration_files,
     own_files,
 )
 from spherloc.mapping.images.lens import for_colmap
-from spherloc.mapping.images.photographs import is_called
 from spherloc.mapping.rig import Key, camera_and_key, taken_together
 from spherloc.types import FloatArray
 

@@ -13,9 +13,9 @@ from spherloc.frontend.features import Features, extract
 from spherloc.frontend.matching import match
 from spherloc.frontend.view import View
 from spherloc.images import read_image
+from spherloc.mapping.images.folder_cameras import CalibratedLens
 from spherloc.mapping.images.image_circle import Circle, image_circle
 from spherloc.mapping.images.lens_fit import PixelPairs, fit_lens
-from spherloc.mapping.images.photographs import CalibratedLens
 from spherloc.mapping.parallel import Tell, as_completed
 from spherloc.registry import require
 from spherloc.types import BoolArray

@@ -20,7 +20,8 @@ from spherloc.files import is_file, is_folder, read_file
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.alignment.true_poses import AlignedTruth
-from spherloc.mapping.images.photographs import CalibratedLens, cameras_of
+from spherloc.mapping.images.folder_cameras import CalibratedLens
+from spherloc.mapping.images.photographs import cameras_of
 from spherloc.mapping.rig import camera_and_key
 from spherloc.mapping.scenes.new_images import NewImages
 
