@@ -35,7 +35,7 @@ from spherloc.mapping.alignment.fixed_images import fixed_images
 from spherloc.mapping.alignment.gravity_check import check_stated
 from spherloc.mapping.alignment.positions import read_positions
 from spherloc.mapping.alignment.sequence import sequence_data
-from spherloc.mapping.alignment.stated_gravity import read_stated_gravity
+from spherloc.mapping.alignment.stated_gravity import StatedGravity, read_stated_gravity
 from spherloc.mapping.alignment.tag_gravity import stated_by_tags
 from spherloc.mapping.alignment.true_poses import truth_words
 from spherloc.mapping.images.folder_cameras import CalibratedLens, LensFinder
@@ -120,31 +120,22 @@ def make(
             measured = kept_scale(target)
             if measured != ScaleMeasurement():
                 say(f"The scale is as it was given before; to make the map without it, remove {target / SCALE_FILE}.")
-        stated = None if gravity is None else read_stated_gravity(*gravity, found.views)
-        unscaled = measured == ScaleMeasurement()
-        data = sequence_data(folder, found.views, gravity=gravity is None, positions=unscaled)
-        stated = stated or data.stated
-        about_gravity: Sequence[str] = ()
-        if stated is None:
-            stated, about_gravity = stated_by_tags(found.views, tell)
-        else:
-            stated = replace(stated, doubts=tuple(check_stated(stated, found.views, tell)))
-            about_gravity = stated.doubts
-        for remark in (*found.remarks, *(() if stated is None else stated.remarks), *data.remarks, *about_gravity):
-            say(remark)
-        others = None
+        others, about_others = None, []
         if new_images is not None:
-            others, remarks = new_images_of(new_images, found, panorama, choice, measured_gravity=gravity is None)
-            for remark in remarks:
-                say(f"{new_images}: {remark}")
+            others, about_others = new_images_of(new_images, found, panorama, choice, measured_gravity=gravity is None)
+        wishes = _Wishes(
+            how,
+            measured,
+            stated=None if gravity is None else read_stated_gravity(*gravity, found.views),
+            new_images=others,
+            masks=masks,
+            find_carried=find_carried,
+        )
+        request, remarks = _request(folder, target, found, wishes, None if camera is None else camera[0], tell)
+        for remark in (*remarks, *(f"{new_images}: {remark}" for remark in about_others)):
+            say(remark)
         say(f"{len(found.views)} {_kind(found.views)} → {target}. Ctrl-C stops it; the same command goes on.")
         try:
-            fixed, about_rig = fixed_images(folder, found.views, None if camera is None else camera[0])
-            for remark in about_rig:
-                say(remark)
-            scaled = replace(ScaleMeasurement(positions=data.positions) if unscaled else measured, fixed=fixed)
-            told = _lens_told(found, target)
-            request = MapRequest(found.views, folder, scaled, others, masks, how, find_carried, stated, told)
             made = make_map(request, target, tell)
             found = _with_lens(found, made)
         except KeyboardInterrupt:
@@ -170,6 +161,50 @@ def make(
         print(f"out of date   {', '.join(older)}: of the map before; give their images with --localize again")
     scenes = tuple(one.written.new_scene for one in (made, *made.groups) if one.written.new_scene is not None)
     return Finished(made.written.scene, scenes, len(made.written.poses) == len(found.views))
+
+
+@dataclass(frozen=True)
+class _Wishes:
+    """What a map is asked for besides its photographs."""
+
+    how: FrontendOptions
+    measured: ScaleMeasurement
+    stated: StatedGravity | None = None
+    """Gravity of a file that the user gave; else that of a recorded sequence or of the tags of images is taken."""
+    new_images: NewImages | None = None
+    masks: Masks | None = None
+    find_carried: bool = True
+
+
+def _request(
+    folder: Path, target: Path, found: Photographs, wishes: _Wishes, calibration: Path | None, tell: Tell
+) -> tuple[MapRequest, list[str]]:
+    """What is asked for a map of photographs in ``folder``, with all that lies beside them, and remarks; ``target`` is
+    the folder of the map, ``calibration`` a file or folder that the user gave."""
+    unscaled = wishes.measured == ScaleMeasurement()
+    data = sequence_data(folder, found.views, gravity=wishes.stated is None, positions=unscaled)
+    stated = wishes.stated or data.stated
+    about_gravity: Sequence[str] = ()
+    if stated is None:
+        stated, about_gravity = stated_by_tags(found.views, tell)
+    else:
+        stated = replace(stated, doubts=tuple(check_stated(stated, found.views, tell)))
+        about_gravity = stated.doubts
+    fixed, about_rig = fixed_images(folder, found.views, calibration)
+    measured = replace(ScaleMeasurement(positions=data.positions) if unscaled else wishes.measured, fixed=fixed)
+    request = MapRequest(
+        found.views,
+        folder,
+        measured,
+        wishes.new_images,
+        wishes.masks,
+        wishes.how,
+        wishes.find_carried,
+        stated,
+        _lens_told(found, target),
+    )
+    of_gravity = () if stated is None else stated.remarks
+    return request, [*found.remarks, *of_gravity, *data.remarks, *about_gravity, *about_rig]
 
 
 @dataclass(frozen=True)
@@ -404,13 +439,7 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
             measured = scale_of_words(scale)
             if measured == ScaleMeasurement():
                 measured = kept_scale(output)
-            unscaled = measured == ScaleMeasurement()
-            data = sequence_data(folder, found.views, positions=unscaled)
-            scaled = ScaleMeasurement(positions=data.positions) if unscaled else measured
-            fixed, about_rig = fixed_images(folder, found.views, None)
-            scaled = replace(scaled, fixed=fixed)
-            lens = _lens_told(found, output)
-            request = MapRequest(found.views, folder, scaled, how=how_of(), stated=data.stated, lens=lens)
+            request, remarks = _request(folder, output, found, _Wishes(how_of(), measured), None, _progress)
             made = make_map(request, output, _progress)
             found = _with_lens(found, made)
             _write(report, made, found, measured, {})
@@ -421,7 +450,7 @@ def main(folder: Path, output: Path, scale: str = "") -> int:
             _tell({"error": _unwritten(report, error)})
             return 1
         others = "other images  open their folder in the list: they can be localized in this map"
-        told = [*found.remarks, *data.remarks, *about_rig, *summary(made, found), f"report        {report}", others]
+        told = [*remarks, *summary(made, found), f"report        {report}", others]
     _tell({"scene": str(made.written.scene), "report": str(report), "summary": told})
     return 0
 
