@@ -110,9 +110,10 @@ def aligned(mapped: Mapping[str, FloatArray], poses: Mapping[str, FloatArray]) -
     return scale, rotation, true.mean(axis=0) - scale * found.mean(axis=0)
 
 
-def cells(folder: Path, poses: Mapping[str, FloatArray]) -> str:
-    """A row of the table."""
-    words = [Path(sys.executable).with_name("spherloc"), "map", "map", "--camera", "calibration.json"]
+def cells(folder: Path, poses: Mapping[str, FloatArray], calibration: str = "calibration.json") -> str:
+    """A row of the table: what the command makes of the images in ``folder``, in ``map`` and ``new``, with a
+    ``calibration`` there."""
+    words = [Path(sys.executable).with_name("spherloc"), "map", "map", "--camera", calibration]
     begin = time.perf_counter()
     done = subprocess.run([*words, "--localize", "new"], cwd=folder, capture_output=True, text=True)
     seconds = time.perf_counter() - begin
@@ -125,7 +126,7 @@ def cells(folder: Path, poses: Mapping[str, FloatArray]) -> str:
     }
     scale, rotation, shift = aligned(mapped, poses)
     scale_line = next(line for line in done.stdout.splitlines() if line.startswith("scale"))
-    found = localized(next((folder / "recordings").glob("*/")))
+    found = localized(next((folder / "recordings").glob("*/"))) if (folder / "recordings").exists() else {}
 
     def off(these: Mapping[str, FloatArray]) -> str:
         if not these:
@@ -135,13 +136,21 @@ def cells(folder: Path, poses: Mapping[str, FloatArray]) -> str:
         turned = [rotation_angle(pose[:, :3] @ rotation.T @ poses[name][:, :3].T) for name, pose in these.items()]
         return f"{100 * np.median(off_m):.1f} ({100 * off_m.max():.1f}) | {np.degrees(np.median(turned)):.2f}"
 
-    images = len(scene.references) + len(scene.queries), len(found)
+    images = len(mapped), len(found)
     asked = [len(list((folder / kind).iterdir())) for kind in ("map", "new")]
     in_map, new = (f"{have} of {count}" for have, count in zip(images, asked, strict=True))
     known = "units unknown"
     if scene.metric:
-        known = f"{100 * (1.0 / scale - 1.0):+.1f} ({scale_line.rpartition('good to ')[2]})"
+        said = scale_line.rpartition("good to ")
+        known = f"{100 * (1.0 / scale - 1.0):+.1f}" + (f" ({said[2]})" if said[1] else "")
     return f"{in_map} | {off(mapped)} | {known} | {new} | {off(found)} | {seconds:.0f}"
+
+
+def print_head() -> None:
+    """The head of the table."""
+    off = "cm off: median (most) | ° off"
+    print(f"| | in the map | {off} | scale, % off (said) | new images localized | {off} | s |")
+    print("|---|---|---|---|---|---|---|---|---|")
 
 
 def main() -> int:
@@ -153,9 +162,7 @@ def main() -> int:
     if not given.data.is_dir():
         print(f"Left out: there is no folder {given.data}.")
         return 0
-    off = "cm off: median (most) | ° off"
-    print(f"| | in the map | {off} | scale, % off (said) | new images localized | {off} | s |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    print_head()
     for row in given.rows:
         world, seed, turn_deg = row.split(":")
         with TemporaryDirectory() as place:
