@@ -219,6 +219,17 @@ def test_named_files_exist(page: Path) -> None:
 
 
 @every_page
+def test_named_benchmarks_exist(page: Path) -> None:
+    """With the options that are named."""
+    for name, words in re.findall(r"-m benchmarks\.(\w+)([^`#\n]*)", page.read_text("utf-8")):
+        module = ROOT / "benchmarks" / name
+        source = (module / "__main__.py") if module.is_dir() else module.with_suffix(".py")
+        assert source.is_file(), name
+        for option in re.findall(r" (--[a-z-]+)", words):
+            assert f'"{option}"' in source.read_text("utf-8"), (name, option)
+
+
+@every_page
 def test_named_targets_of_make_exist(page: Path) -> None:
     targets = set(re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
     shell = "".join(block.text for block in blocks(page) if block.language == "sh")

@@ -53,7 +53,7 @@ MANY_FIT_PEAK = 140
 """Two panoramas with fewer matches that fit, and a peak below ``PEAK``, may show two places that look alike."""
 SURE = 200.0
 """Of other images, which share a part of their view only, a pose is sure if so many matches fit it, times the cube of
-its peak: 60 matches with a peak of 1.5, or 25 with one of 2. ``benchmarks.headset`` shows pairs by that number."""
+its peak: 60 matches with a peak of 1.5, or 25 with one of 2. ``benchmarks.fisheyes`` shows pairs by that number."""
 MANY_SURE = 70
 """It is sure, too, if so many matches fit: on facades they fit many directions."""
 FAR = 1.0 / 3.0
