@@ -26,7 +26,7 @@ from spherloc.mapping.images.lens import for_colmap
 from spherloc.mapping.rig import Key, camera_and_key, taken_together
 from spherloc.types import FloatArray
 
-MIN_TIMES = 3
+MIN_TIMES = 2
 """Least number of times at which two cameras took images together."""
 MIN_BASELINE_M = 1e-3
 """Cameras that are closer are in one place."""

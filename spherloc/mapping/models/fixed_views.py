@@ -1,11 +1,12 @@
 """Images that were taken together by cameras whose calibration says how they are fixed to each other: what it tells of
-pairs of them, and a map of a single moment, where it is all that places them.
+pairs of them, of all images in COLMAP's mapper, and of a single moment, where it is all that places them.
 
 Four fisheyes of a car at a single moment share thin parts of their views. Neighbours match there, but no point is seen
-by three of them, so that nothing ties the lengths of their baselines to each other. The calibration does.
+by three of them, so that nothing ties the lengths of their baselines to each other. The calibration does. The mapper
+takes the images of a moment for one: where two moments match in the front camera alone, all others are placed, too.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -16,10 +17,11 @@ from spherloc.geometry import inverse_pose
 from spherloc.mapping.alignment.fixed_images import MIN_BASELINE_M, FixedImages
 from spherloc.mapping.models.later import with_images
 from spherloc.mapping.models.misplaced import fits
-from spherloc.mapping.models.model import Reconstruction
+from spherloc.mapping.models.model import Reconstruction, registered
 from spherloc.mapping.two_view.matched import Matched
 from spherloc.mapping.two_view.pairs import MIN_MATCHES, relative
 from spherloc.mapping.two_view.triangles import Pair, Relative
+from spherloc.types import FloatArray
 
 
 def fixed_pairs(views: Sequence[View], fixed: FixedImages | None) -> dict[Pair, Relative]:
@@ -39,10 +41,58 @@ def fixed_pairs(views: Sequence[View], fixed: FixedImages | None) -> dict[Pair, 
     return found
 
 
+def fix_cameras(pycolmap: Any, database: Any, ids: Mapping[str, int], fixed: FixedImages) -> None:
+    """Write into an open database of images with these ``ids``, each with a rig of its own, that the cameras of those
+    that were taken together are fixed to each other."""
+    together = [names for names in fixed.times.values() if len(names) > 1]
+    inside = {name for names in together for name in names}
+    images = {name: database.read_image(number) for name, number in ids.items()}
+    alone = {name: database.read_rig(database.read_frame(images[name].frame_id).rig_id) for name in ids.keys() - inside}
+    database.clear_frames()
+    database.clear_rigs()
+    rig, first = pycolmap.Rig(), None
+    of_body: dict[tuple[int, bytes], Any] = {}
+    for name in sorted(inside):
+        image, body_from_camera = images[name], fixed.body_from_camera[name]
+        key = image.camera_id, body_from_camera.tobytes()
+        if key not in of_body:
+            camera = database.read_camera(image.camera_id)
+            camera.camera_id = database.write_camera(camera)
+            of_body[key] = camera
+            if first is None:
+                first = body_from_camera
+                rig.add_ref_sensor(camera.sensor_id)
+            else:
+                sensor_from_rig = np.linalg.inv(body_from_camera) @ first
+                rig.add_sensor(camera.sensor_id, pycolmap.Rigid3d(sensor_from_rig[:3]))
+        image.camera_id = of_body[key].camera_id
+    rig.rig_id = database.write_rig(rig)
+    for names in together:
+        _write_frame(pycolmap, database, rig.rig_id, [images[name] for name in names])
+    written: dict[int, int] = {}
+    for name, own in sorted(alone.items()):
+        if own.rig_id not in written:
+            one = pycolmap.Rig()
+            one.add_ref_sensor(own.ref_sensor_id)
+            written[own.rig_id] = database.write_rig(one)
+        _write_frame(pycolmap, database, written[own.rig_id], [images[name]])
+
+
+def _write_frame(pycolmap: Any, database: Any, rig_id: int, images: Sequence[Any]) -> None:
+    frame = pycolmap.Frame()
+    frame.rig_id = rig_id
+    for image in images:
+        frame.add_data_id(image.data_id)
+    number = database.write_frame(frame)
+    for image in images:
+        image.frame_id = number
+        database.update_image(image)
+
+
 def placed_by_calibration(pycolmap: Any, matched: Matched, fixed: FixedImages) -> Reconstruction | None:
     """The map of images of one time where the calibration has them, in the frame of the body, metres, without those
     that match no other one; None if no more of the matches agree with it than contradict it."""
-    names, counts = matched.names, matched.counts()
+    names = matched.names
     poses = {name: inverse_pose(matrix[:3]) for name, matrix in fixed.body_from_camera.items()}
     balance = 0
     for (one, other), geometry in matched.verified.items():
@@ -50,8 +100,16 @@ def placed_by_calibration(pycolmap: Any, matched: Matched, fixed: FixedImages) -
         balance += len(geometry.inlier_matches) if agrees else -len(geometry.inlier_matches)
     if balance <= 0:
         return None
+    made = triangulated(pycolmap, matched, poses)
+    return made if len(made.poses) > 1 else None
+
+
+def triangulated(pycolmap: Any, matched: Matched, poses: Mapping[str, FloatArray]) -> Reconstruction:
+    """The model of images with these poses (3, 4), each in a frame of its own, with the points that they see, without
+    images that see hardly any: only the calibration would speak for them."""
+    counts = matched.counts()
     every = counts + matched.same_place
     empty = Reconstruction(pycolmap.Reconstruction(), {}, counts, (), every, matched.database, matched.ids)
-    matching = [name for name, best in zip(names, counts.max(axis=1).tolist(), strict=True) if best >= MIN_MATCHES]
-    made = with_images(empty, {name: poses[name] for name in matching}, adjust=False)
-    return made if len(made.model.points3D) >= MIN_MATCHES else None
+    made = with_images(empty, poses, adjust=False)
+    seen = {image.name: image.num_points3D for image in registered(made.model)}
+    return made.without({name for name, count in seen.items() if count < MIN_MATCHES})

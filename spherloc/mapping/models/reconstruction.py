@@ -7,8 +7,9 @@ poster or a floor that looks the same elsewhere.
 Where places look alike, a map may take two for one (see ``model``). A second map is made from the strong pairs alone,
 and the one with more images in all its parts, minus a penalty for contradictions, is taken. Where contradictions cut a
 map, both are made again without the pairs that had joined its parts. Where cameras took images together, maps of each
-by itself are another candidate, joined by these images (see ``rig``). What is still apart is joined by single pairs
-(see ``joining``), but for images of several cameras that are no panoramas.
+by itself are another candidate, joined by these images (see ``rig``). Where a calibration says how the cameras are
+fixed to each other, a map with such cameras is made first, and taken if it has nearly all images. What is still apart
+is joined by single pairs (see ``joining``), but for images of several cameras that are no panoramas.
 """
 
 import shutil
@@ -29,7 +30,7 @@ from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.alignment.fixed_images import FixedImages
 from spherloc.mapping.alignment.upright import level_of
-from spherloc.mapping.models.fixed_views import fixed_pairs, placed_by_calibration
+from spherloc.mapping.models.fixed_views import fix_cameras, fixed_pairs, placed_by_calibration, triangulated
 from spherloc.mapping.models.joining import joined_by_pairs
 from spherloc.mapping.models.later import with_images
 from spherloc.mapping.models.misplaced import fits, without_misplaced
@@ -73,7 +74,7 @@ def reconstruct(
     The map with most images comes first, then maps of other images that could not be joined with it.
 
     ``gravity`` is that from the images' vertical lines, ``how`` the features and their matching, SIFT if it is None.
-    ``fixed`` says how their cameras are fixed to each other; of images of one time it places them.
+    ``fixed`` says how their cameras are fixed to each other.
 
     Raises ``InputError`` if pycolmap is missing, if an image or the folder cannot be used, or if no two images fit
     together, and ``StoppedError`` if there is no room for the database.
@@ -86,6 +87,9 @@ def reconstruct(
         placed = placed_by_calibration(pycolmap, matched, fixed)
         if placed is not None:
             return (placed,)
+    rig = _with_fixed_cameras(pycolmap, matched, fixed, tell) if together else ()
+    if rig and worth(rig[0]) >= WHOLE * len(views):
+        return rig
     panoramas = all(isinstance(view.camera, Equirectangular) for view in views)
     shots, left = shots_of(views), matched
     known = {view.name: one for view, one in zip(views, gravity, strict=True) if one is not None}
@@ -95,7 +99,7 @@ def reconstruct(
         left = replace(left, same_place=with_ties(counts + matched.same_place, matched.names, shots) - counts)
     evidence = PairEvidence(matched) if panoramas or not shots else None
     held = _held(pycolmap, matched, evidence, tell) if evidence is not None and not panoramas else ()
-    made = [held] if held else [rigid, *_of_sure_pairs(pycolmap, left, evidence, tell)]
+    made = [held] if held else [rigid, *_of_sure_pairs(pycolmap, left, evidence, tell), rig]
     candidates = [models for models in made if models]
     if rigid:
         candidates = [models for models in candidates if not any(went_apart(one.poses, shots) for one in models)]
@@ -104,7 +108,7 @@ def reconstruct(
             f"COLMAP could not start a map from these {len(views)} photographs, although pairs of them match: they "
             "may have been taken from one place. Take them half a metre to two metres apart."
         )
-    # Most images in all, then in one map, then those by strong pairs.
+    # Most images in all, then in one map, then that with fixed cameras, then those by strong pairs.
     best = max(reversed(candidates), key=lambda models: (sum(map(worth, models)), worth(models[0])))
     found = best if evidence is None else joined_by_pairs(best, matched, evidence, tell)
     return tuple(replace(one, unsure=matched.none_sure) for one in found)
@@ -139,6 +143,16 @@ def _held(pycolmap: Any, matched: Matched, evidence: PairEvidence, tell: Tell) -
     if not models or len(models[0].poses) < WHOLE * len(matched.ids):
         return ()
     return models if evidence.least_holding(models[0].poses) >= HELD else ()
+
+
+def _with_fixed_cameras(
+    pycolmap: Any, matched: Matched, fixed: FixedImages | None, tell: Tell
+) -> tuple[Reconstruction, ...]:
+    """Models in which cameras stand to each other as the calibration says; none without one."""
+    if fixed is None or fixed.one_time:
+        return ()
+    models, _ = _models_of(pycolmap, _UsedPairs(matched, matched.counts()), tell, fixed=fixed)
+    return models
 
 
 def _rigid(
@@ -180,23 +194,33 @@ class _UsedPairs:
 
 
 def _models_of(
-    pycolmap: Any, used: _UsedPairs, tell: Tell, evidence: PairEvidence | None = None
+    pycolmap: Any,
+    used: _UsedPairs,
+    tell: Tell,
+    evidence: PairEvidence | None = None,
+    fixed: FixedImages | None = None,
 ) -> tuple[tuple[Reconstruction, ...], set[Names]]:
     """Models of the pairs that are used, the largest first, and the pairs that joined what contradictions showed to be
-    apart. With ``evidence``, models are cut, too, where images stand elsewhere than their pair says."""
+    apart. With ``evidence``, models are cut, too, where images stand elsewhere than their pair says; with ``fixed``,
+    cameras are fixed to each other."""
     matched, counts = used.matched, used.counts
     with TemporaryDirectory() as folder:  # COLMAP writes its models into a folder
         database = Path(folder) / "matches.db"
         used.write(pycolmap, database)
+        if fixed is not None:
+            with pycolmap.Database.open(str(database)) as opened:
+                fix_cameras(pycolmap, opened, matched.ids, fixed)
         models = _models(pycolmap, database, Path(folder), len(matched.ids), tell)
     rotations, agreeing = matched.rotations(matched.verified), matched.rotations(matched.agreed)
     found, cut = list[Reconstruction](), set[Names]()
     for model in models:
         poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in registered(model)}
-        every = counts + matched.same_place
-        whole = without_misplaced(
-            Reconstruction(model, poses, counts, (), every, matched.database, matched.ids), agreeing
-        )
+        if fixed is None:
+            every = counts + matched.same_place
+            placed = Reconstruction(model, poses, counts, (), every, matched.database, matched.ids)
+        else:
+            placed = triangulated(pycolmap, matched, poses)
+        whole = without_misplaced(placed, agreeing)
         if len(whole.poses) > 1:
             parts, misplaced = _parts(whole.judged(), evidence)
             cut |= _cut(whole, parts, {pair: one for pair, one in rotations.items() if pair not in misplaced})
