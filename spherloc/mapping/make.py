@@ -245,6 +245,7 @@ def _finished(
     made = made.without(level.leaning.keys() | misfits(made.poses, shots) | far_off(made.poses))
     if fixed is not None:
         made = made.without(turned_otherwise(made.poses, fixed))
+    made = made.without_near_points()
     return made, level, scale_of(made, level, measured)
 
 

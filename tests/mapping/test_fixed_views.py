@@ -76,7 +76,9 @@ def test_the_calibration_places_the_images_of_one_moment(car, tmp_path):
     """In metres, where no three of them see a point; and each point is where the picture shows it."""
     folder, poses, ranges = of_one_moment(car, tmp_path / "moment")
     made, fixed = made_of(folder, tmp_path / "map")
-    assert fixed.one_time and made.scale.source.startswith("the calibration of each image, which places the images of")
+    assert fixed.one_moment and made.scale.source.startswith(
+        "the calibration of each image, which places the images of"
+    )
     assert set(made.written.poses) == set(poses)
     names = sorted(poses)
     for name in names[1:]:
@@ -103,7 +105,7 @@ def test_fixed_cameras_tie_two_moments(car, tmp_path):
     """In metres, though two moments are too few for maps of single cameras to be joined by them."""
     folder, poses, _ = car
     made, fixed = made_of(folder, tmp_path / "map")
-    assert not fixed.one_time and set(made.written.poses) == set(poses)
+    assert not fixed.one_moment and set(made.written.poses) == set(poses)
     assert "at 2 times" in made.scale.source
     names = sorted(poses)
     centres, true = (np.array([camera_centre(one[name]) for name in names]) for one in (made.written.poses, poses))
@@ -119,6 +121,6 @@ def test_a_calibration_of_another_car_places_nothing(car, tmp_path):
     for name, other in zip(order, (*order[2:], *order[:2]), strict=True):
         (wrong / f"00000_{name}.json").write_text(json.dumps(calibration(other) | {"name": name}))
     made, fixed = made_of(wrong, tmp_path / "map")
-    assert fixed.one_time and not made.scale.source
+    assert fixed.one_moment and not made.scale.source
     assert "turned against each other" in made.scale.why_unknown and "otherwise than it says" in made.scale.why_unknown
     assert len(made.written.poses) < len(poses)

@@ -79,16 +79,16 @@ def test_each_image_has_its_own_calibration(car, layout):
 
 
 @pytest.mark.parametrize(
-    ("called", "one_time"),
+    ("called", "one_moment"),
     [
         ("{camera}", True),
         ("00012_{camera}", True),
-        ("{camera}_1700000000.0{number}", True),
-        ("{camera}_1700000000.{number}", False),
+        ("{camera}_1700000000.000{number}", True),
+        ("{camera}_1700000000.0{number}", False),
         ("0000{number}_{camera}", False),
     ],
 )
-def test_images_of_one_moment(tmp_path, rng, called, one_time):
+def test_images_of_one_moment(tmp_path, rng, called, one_moment):
     """Each is of another camera, and no name says that they were taken one after another."""
     for number, camera in enumerate(CAMERAS):
         name = called.format(camera=camera, number=number)
@@ -97,10 +97,10 @@ def test_images_of_one_moment(tmp_path, rng, called, one_time):
     views = photographs(tmp_path, {}).views
     fixed, _ = fixed_images(tmp_path, views, None)
     pairs = fixed_pairs(views, fixed)
-    if not one_time:
+    if not one_moment:
         assert fixed is None and not pairs
         return
-    assert fixed is not None and fixed.one_time and len(pairs) == 6
+    assert fixed is not None and fixed.one_moment and len(pairs) == 6
     names = [view.name for view in views]
     front, rear = (next(k for k, name in enumerate(names) if camera in name) for camera in ("FV", "RV"))
     rotation, direction = pairs[min(front, rear), max(front, rear)]

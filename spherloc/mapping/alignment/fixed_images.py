@@ -30,8 +30,8 @@ MIN_TIMES = 2
 """Least number of times at which two cameras took images together."""
 MIN_BASELINE_M = 1e-3
 """Cameras that are closer are in one place."""
-SAME_TIME_NS = 50e6
-"""Images of one time differ by no more, where each camera took one."""
+SAME_MOMENT_NS = 5e6
+"""Images whose times differ by more are not of one moment: a head turns by half a degree meanwhile, a car goes 5 cm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,10 @@ class FixedImages:
     times: Mapping[int, Sequence[str]]
     """Names of the images that were taken together, those of one camera first, by a number of their time; none if it is
     not known which these are."""
-    one_time: bool = False
-    """Whether all images are of one time, each of another camera: then nothing else tells how they stand to each
+    moments: Sequence[Sequence[str]] = ()
+    """Names of those of them that were taken at the same moment: two or more each."""
+    one_moment: bool = False
+    """Whether all images are of one moment, each of another camera: then nothing else tells how they stand to each
     other."""
 
 
@@ -166,9 +168,9 @@ def _for_images(path: Path, name: str, size: tuple[int, int]) -> Camera | None:
 
 def _together(views: Sequence[View], placed: Mapping[str, tuple[str, FloatArray]], source: str) -> FixedImages | None:
     """The images that were taken together, of those with a camera's name and ``body_from_camera`` (4, 4)."""
-    if _at_one_time(views, placed):
+    if _of_one_moment(views, placed):
         bodies = {name: matrix for name, (_, matrix) in placed.items()}
-        return FixedImages(source, bodies, {0: sorted(bodies)}, one_time=True)
+        return FixedImages(source, bodies, {0: sorted(bodies)}, [sorted(bodies)], one_moment=True)
     keys: dict[str, dict[str, Key]] = {}
     for view in views:
         if view.name in placed:
@@ -180,17 +182,32 @@ def _together(views: Sequence[View], placed: Mapping[str, tuple[str, FloatArray]
     if not times and len(_takers(views)) < 2:
         return None
     bodies = {name: placed[name][1] for names in times.values() for name in names}
-    return FixedImages(source, bodies, times)
+    every = {name: key for images in keys.values() for name, key in images.items()}
+    moments = [moment for names in times.values() for moment in _moments(names, every) if len(moment) > 1]
+    return FixedImages(source, bodies, times, moments)
 
 
-def _at_one_time(views: Sequence[View], placed: Mapping[str, tuple[str, FloatArray]]) -> bool:
+def _moments(names: Sequence[str], keys: Mapping[str, Key]) -> list[list[str]]:
+    """Images that were taken together, parted where their times differ by more than ``SAME_MOMENT_NS``."""
+    if not all(keys[name].is_time for name in names):
+        return [list(names)]
+    found: list[list[str]] = []
+    for name in sorted(names, key=lambda name: keys[name].number):
+        if found and keys[name].number - keys[found[-1][0]].number <= SAME_MOMENT_NS:
+            found[-1].append(name)
+        else:
+            found.append([name])
+    return found
+
+
+def _of_one_moment(views: Sequence[View], placed: Mapping[str, tuple[str, FloatArray]]) -> bool:
     """Whether each image is of another camera, and names or times tell no different moments."""
     cameras = {placed[view.name][0] for view in views if view.name in placed}
     if not len(cameras) == len(views) > 1:
         return False
     keys = [_moment(view, placed[view.name][0]) for view in views]
     numbers = [key.number for key in keys]
-    same = SAME_TIME_NS if all(key.is_time for key in keys) else 0.0
+    same = SAME_MOMENT_NS if all(key.is_time for key in keys) else 0.0
     return max(numbers) - min(numbers) <= same
 
 

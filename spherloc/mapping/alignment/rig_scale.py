@@ -38,6 +38,9 @@ MIN_FOR_LEVER = 6
 """Least number of times from which on a lever is fitted."""
 LEVER_SD = 100.0
 """What is known of the lever: a standard deviation in distances of the cameras."""
+SAME, OFF_IF_FIXED = 0.01, 2.0
+"""Where the mapper had the cameras fixed to each other, all times say the same, to the first share of what the cameras
+differ by; the scale then is off by the second number times as much as these tell (``benchmarks.headset``: 1.8)."""
 ROUNDS = 10
 """Number of times that the scale is fitted to what fits it."""
 
@@ -48,8 +51,8 @@ def scale_by_rig(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScal
     ``poses`` (3, 4) are those of the map, by name. Raises ``InputError`` if there are too few such images in it, or if
     these do not fix the scale to ``MAX_SCALE_SD``.
     """
-    if fixed.one_time:
-        return _scale_of_one_time(poses, fixed)
+    if fixed.one_moment:
+        return _scale_of_one_moment(poses, fixed)
     times = [[name for name in names if name in poses] for names in fixed.times.values()]
     times = [names for names in times if len(names) > 1]
     none = NONE.format(fixed.source)
@@ -72,6 +75,8 @@ def scale_by_rig(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScal
     # Of three images that were taken together the third distance tells nothing new, and few times tell little.
     free = sum(len(names) - 1 for names in times)
     relative = float(np.sqrt(len(pairs) / free)) * max(scattered * (1.0 + 5.0 / (len(times) - 1)), steady)
+    if scattered < SAME * steady:
+        relative *= OFF_IF_FIXED
     apart = _range_m(np.linalg.norm(stated, axis=1))
     seen = f"images that cameras {apart} apart took together, at {len(times)} times"
     if not relative <= MAX_SCALE_SD:
@@ -80,8 +85,8 @@ def scale_by_rig(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScal
     return MapScale(1.0 / units, f"{fixed.source}: {seen}; the scale is good to {max(relative, 5e-4):.1%}")
 
 
-def _scale_of_one_time(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScale:
-    """The scale of a map of images of one time, which has them as the calibration does, but for a factor.
+def _scale_of_one_moment(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScale:
+    """The scale of a map of images of one moment, which has them as the calibration does, but for a factor.
 
     Raises ``InputError`` if it has them otherwise, or fewer than two.
     """
@@ -94,7 +99,7 @@ def _scale_of_one_time(poses: Mapping[str, FloatArray], fixed: FixedImages) -> M
     _check_metres(none, stated_m)
     if stated_m.max() <= MIN_BASELINE_M or np.median(turned_rad) > TURNED_RAD:
         raise InputError(_otherwise(none, turned_rad))
-    source = f"{fixed.source}, which places the images of a single time: {_range_m(stated_m)} apart"
+    source = f"{fixed.source}, which places the images of a single moment: {_range_m(stated_m)} apart"
     return MapScale(float(stated_m.sum() / mapped.sum()), source)
 
 

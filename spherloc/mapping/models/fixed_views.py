@@ -7,6 +7,7 @@ takes the images of a moment for one: where two moments match in the front camer
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
@@ -15,23 +16,22 @@ import numpy as np
 from spherloc.frontend.view import View
 from spherloc.geometry import inverse_pose
 from spherloc.mapping.alignment.fixed_images import MIN_BASELINE_M, FixedImages
-from spherloc.mapping.models.later import with_images
+from spherloc.mapping.models.later import register, with_images
 from spherloc.mapping.models.misplaced import fits
 from spherloc.mapping.models.model import Reconstruction, registered
 from spherloc.mapping.two_view.matched import Matched
 from spherloc.mapping.two_view.pairs import MIN_MATCHES, relative
 from spherloc.mapping.two_view.triangles import Pair, Relative
-from spherloc.types import FloatArray
 
 
 def fixed_pairs(views: Sequence[View], fixed: FixedImages | None) -> dict[Pair, Relative]:
-    """The relative poses of images that were taken together, by the places of both among ``views``; none without a
+    """The relative poses of images that were taken at one moment, by the places of both among ``views``; none without a
     calibration, and none of cameras that it has in one place."""
     if fixed is None:
         return {}
     places = {view.name: place for place, view in enumerate(views)}
     found: dict[Pair, Relative] = {}
-    for names in fixed.times.values():
+    for names in fixed.moments:
         for one, other in combinations(sorted(places[name] for name in names), 2):
             first, second = (fixed.body_from_camera[views[place].name] for place in (one, other))
             second_from_first = np.linalg.inv(second) @ first
@@ -43,9 +43,8 @@ def fixed_pairs(views: Sequence[View], fixed: FixedImages | None) -> dict[Pair, 
 
 def fix_cameras(pycolmap: Any, database: Any, ids: Mapping[str, int], fixed: FixedImages) -> None:
     """Write into an open database of images with these ``ids``, each with a rig of its own, that the cameras of those
-    that were taken together are fixed to each other."""
-    together = [names for names in fixed.times.values() if len(names) > 1]
-    inside = {name for names in together for name in names}
+    that were taken at one moment are fixed to each other."""
+    inside = {name for names in fixed.moments for name in names}
     images = {name: database.read_image(number) for name, number in ids.items()}
     alone = {name: database.read_rig(database.read_frame(images[name].frame_id).rig_id) for name in ids.keys() - inside}
     database.clear_frames()
@@ -67,7 +66,7 @@ def fix_cameras(pycolmap: Any, database: Any, ids: Mapping[str, int], fixed: Fix
                 rig.add_sensor(camera.sensor_id, pycolmap.Rigid3d(sensor_from_rig[:3]))
         image.camera_id = of_body[key].camera_id
     rig.rig_id = database.write_rig(rig)
-    for names in together:
+    for names in fixed.moments:
         _write_frame(pycolmap, database, rig.rig_id, [images[name] for name in names])
     written: dict[int, int] = {}
     for name, own in sorted(alone.items()):
@@ -90,7 +89,7 @@ def _write_frame(pycolmap: Any, database: Any, rig_id: int, images: Sequence[Any
 
 
 def placed_by_calibration(pycolmap: Any, matched: Matched, fixed: FixedImages) -> Reconstruction | None:
-    """The map of images of one time where the calibration has them, in the frame of the body, metres, without those
+    """The map of images of one moment where the calibration has them, in the frame of the body, metres, without those
     that match no other one; None if no more of the matches agree with it than contradict it."""
     names = matched.names
     poses = {name: inverse_pose(matrix[:3]) for name, matrix in fixed.body_from_camera.items()}
@@ -100,16 +99,30 @@ def placed_by_calibration(pycolmap: Any, matched: Matched, fixed: FixedImages) -
         balance += len(geometry.inlier_matches) if agrees else -len(geometry.inlier_matches)
     if balance <= 0:
         return None
-    made = triangulated(pycolmap, matched, poses)
+    made = _of_seen(with_images(_empty(pycolmap, matched), poses, adjust=False))
     return made if len(made.poses) > 1 else None
 
 
-def triangulated(pycolmap: Any, matched: Matched, poses: Mapping[str, FloatArray]) -> Reconstruction:
-    """The model of images with these poses (3, 4), each in a frame of its own, with the points that they see, without
-    images that see hardly any: only the calibration would speak for them."""
+def with_single_images(pycolmap: Any, matched: Matched, rigs: Any) -> Reconstruction:
+    """A model of COLMAP with ``fix_cameras``, with each image in a frame of its own instead, from which it can be
+    taken."""
+    made = _empty(pycolmap, matched)
+    poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in registered(rigs)}
+    register(made, poses)
+    for point in rigs.points3D.values():
+        made.model.add_point3D(point.xyz, point.track, point.color)
+    made.model.update_point_3d_errors()
+    return _of_seen(replace(made, poses=poses))
+
+
+def _empty(pycolmap: Any, matched: Matched) -> Reconstruction:
+    """A model without images."""
     counts = matched.counts()
     every = counts + matched.same_place
-    empty = Reconstruction(pycolmap.Reconstruction(), {}, counts, (), every, matched.database, matched.ids)
-    made = with_images(empty, poses, adjust=False)
+    return Reconstruction(pycolmap.Reconstruction(), {}, counts, (), every, matched.database, matched.ids)
+
+
+def _of_seen(made: Reconstruction) -> Reconstruction:
+    """The model without images that see hardly a point: only the calibration would speak for their place."""
     seen = {image.name: image.num_points3D for image in registered(made.model)}
     return made.without({name for name, count in seen.items() if count < MIN_MATCHES})

@@ -77,7 +77,7 @@ def _key(
             parts += [down.down.tobytes(), down.source, down.bound_rad, down.sd_rad, down.by_map]
         parts.append(None)
     if fixed is not None:
-        parts += [sorted(fixed.times.items())]
+        parts += [fixed.moments, fixed.one_moment]
         parts += [part for name, matrix in sorted(fixed.body_from_camera.items()) for part in (name, matrix.tobytes())]
     return key_of(*parts, sorted(shots_of(views).items()))
 

@@ -21,6 +21,7 @@ from spherloc.geometry import DOWN, transform
 from spherloc.mapping.alignment.fixed_images import FixedImages
 from spherloc.mapping.alignment.rig_poses import expected_by_calibration
 from spherloc.mapping.alignment.upright import Level, arbitrary_scale
+from spherloc.mapping.models.colmap_options import pipeline_options
 from spherloc.mapping.models.model import Reconstruction, SeenPoints, contradictions, points_of
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.rig import expected_poses, shots_of
@@ -168,19 +169,13 @@ def _with(made: Reconstruction, placed: Mapping[str, _Placed], adjust: bool = Tr
     """The map with more images, as ``with_images``."""
     pycolmap = require("pycolmap", "colmap", "making a map")
     model = made.model
+    register(made, {name: one.cam_from_model for name, one in placed.items()})
     for name, one in placed.items():
-        frame_id = _image_in(pycolmap, made, made.ids[name])
-        model.frame(frame_id).rig_from_world = pycolmap.Rigid3d(one.cam_from_model)
-        model.register_frame(frame_id)
         for feature, point in zip(one.features.tolist(), one.points.tolist(), strict=True):
             model.add_observation(point, pycolmap.TrackElement(made.ids[name], feature))
     with TemporaryDirectory() as folder:
-        options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads, options.random_seed = 1, 0
-        options.triangulation.ignore_two_view_tracks = False
-        model = pycolmap.triangulate_points(
-            model, str(made.database), folder, folder, clear_points=False, options=options, refine_intrinsics=False
-        )
+        options, database = pipeline_options(pycolmap), str(made.database)
+        model = pycolmap.triangulate_points(model, database, folder, folder, False, options, refine_intrinsics=False)
     if adjust:
         adjusted(pycolmap, model)
     poses = {
@@ -188,6 +183,15 @@ def _with(made: Reconstruction, placed: Mapping[str, _Placed], adjust: bool = Tr
         for image in (model.image(number) for number in model.reg_image_ids())
     }
     return replace(made, model=model, poses=poses).judged()
+
+
+def register(made: Reconstruction, poses: Mapping[str, FloatArray]) -> None:
+    """Give images poses (3, 4) in a model, which sees nothing of theirs yet."""
+    pycolmap = require("pycolmap", "colmap", "making a map")
+    for name, cam_from_model in poses.items():
+        frame_id = _image_in(pycolmap, made, made.ids[name])
+        made.model.frame(frame_id).rig_from_world = pycolmap.Rigid3d(cam_from_model)
+        made.model.register_frame(frame_id)
 
 
 def _image_in(pycolmap: Any, made: Reconstruction, number: int) -> int:

@@ -16,6 +16,7 @@ import numpy as np
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.errors import CalibrationError
 from spherloc.mapping.images.lens_fit import RadialLens
+from spherloc.mapping.models.colmap_options import pipeline_options
 from spherloc.mapping.models.model import Reconstruction, registered
 from spherloc.mapping.parallel import Tell
 from spherloc.registry import require
@@ -133,9 +134,7 @@ def _triangulated(pycolmap: Any, model: Any, number: int, lens: RadialLens, data
     camera = model.camera(number)
     camera.model = pycolmap.CameraModelId.OPENCV_FISHEYE  # as the database has it
     camera.params = [lens.f, lens.f, lens.cx, lens.cy, lens.k1, lens.k2, 0.0, 0.0]
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed = 1, 0
-    options.triangulation.ignore_two_view_tracks = False
+    options = pipeline_options(pycolmap)
     with TemporaryDirectory() as folder:  # COLMAP writes nothing there, but asks for it
         return pycolmap.triangulate_points(model, database, folder, folder, True, options, False)
 

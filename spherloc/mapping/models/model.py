@@ -37,6 +37,9 @@ aside, right neighbours may see as little of each other's points."""
 EXPECTED_SEEN = 8, 20
 """So many of so many points are added to those that two images see, and should see, alike: where a map is cut, few
 points say little."""
+NEAR_SEEN, MIN_DISTANCE = 2, 0.1
+"""A point that so many images see is wrong if one of them is nearer than that share of the distance (median) of what
+it sees: nobody holds a camera so close to things."""
 COST_OF_CONTRADICTION = 4.0
 """Weight of the share of contradictions when two maps are compared by their share of images."""
 
@@ -92,6 +95,25 @@ class Reconstruction:
         poses = {name: pose for name, pose in self.poses.items() if name not in names}
         against = tuple(pair for pair in self.contradictions if not set(pair) & set(names))
         return replace(self, poses=poses, contradictions=against)
+
+    def without_near_points(self) -> "Reconstruction":
+        """The model without points that only two images see, and that are much nearer to one of them than its others:
+        a wrong match of two images that were taken close to each other gives such a point."""
+        centres = {number: self.model.image(number).projection_center() for number in self.model.reg_image_ids()}
+        far: dict[int, list[float]] = {number: [] for number in centres}
+        pairs: dict[int, dict[int, float]] = {}
+        for key, point in self.model.points3D.items():
+            images = [one.image_id for one in point.track.elements]
+            away = {number: float(np.linalg.norm(point.xyz - centres[number])) for number in images}
+            for number, distance in away.items():
+                far[number].append(distance)
+            if len(images) == NEAR_SEEN:
+                pairs[key] = away
+        usual = {number: float(np.median(found)) for number, found in far.items() if found}
+        for key, away in pairs.items():
+            if any(distance < MIN_DISTANCE * usual[number] for number, distance in away.items()):
+                self.model.delete_point3D(key)
+        return self
 
     def judged(self) -> "Reconstruction":
         """The model with its contradictions computed anew."""

@@ -30,7 +30,8 @@ from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.alignment.fixed_images import FixedImages
 from spherloc.mapping.alignment.upright import level_of
-from spherloc.mapping.models.fixed_views import fix_cameras, fixed_pairs, placed_by_calibration, triangulated
+from spherloc.mapping.models.colmap_options import pipeline_options
+from spherloc.mapping.models.fixed_views import fix_cameras, fixed_pairs, placed_by_calibration, with_single_images
 from spherloc.mapping.models.joining import joined_by_pairs
 from spherloc.mapping.models.later import with_images
 from spherloc.mapping.models.misplaced import fits, without_misplaced
@@ -83,7 +84,7 @@ def reconstruct(
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # errors are reported here instead
     together = fixed_pairs(views, fixed)
     matched = match_all(pycolmap, views, gravity, folder, tell, how or FrontendOptions(), together)
-    if fixed is not None and fixed.one_time:
+    if fixed is not None and fixed.one_moment:
         placed = placed_by_calibration(pycolmap, matched, fixed)
         if placed is not None:
             return (placed,)
@@ -149,7 +150,7 @@ def _with_fixed_cameras(
     pycolmap: Any, matched: Matched, fixed: FixedImages | None, tell: Tell
 ) -> tuple[Reconstruction, ...]:
     """Models in which cameras stand to each other as the calibration says; none without one."""
-    if fixed is None or fixed.one_time:
+    if fixed is None or fixed.one_moment:
         return ()
     models, _ = _models_of(pycolmap, _UsedPairs(matched, matched.counts()), tell, fixed=fixed)
     return models
@@ -214,12 +215,12 @@ def _models_of(
     rotations, agreeing = matched.rotations(matched.verified), matched.rotations(matched.agreed)
     found, cut = list[Reconstruction](), set[Names]()
     for model in models:
-        poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in registered(model)}
         if fixed is None:
+            poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in registered(model)}
             every = counts + matched.same_place
             placed = Reconstruction(model, poses, counts, (), every, matched.database, matched.ids)
         else:
-            placed = triangulated(pycolmap, matched, poses)
+            placed = with_single_images(pycolmap, matched, model)
         whole = without_misplaced(placed, agreeing)
         if len(whole.poses) > 1:
             parts, misplaced = _parts(whole.judged(), evidence)
@@ -284,16 +285,13 @@ def _joined(
 
 def _models(pycolmap: Any, database: Path, folder: Path, count: int, tell: Tell) -> list[Any]:
     """COLMAP's models, the one with most images first; none if it finds no first pair."""
-    options = pycolmap.IncrementalPipelineOptions()
-    options.min_num_matches, options.min_model_size, options.random_seed = MIN_MATCHES, 2, 0
-    options.num_threads = 1  # with more threads every run gives another map
-    options.ba_refine_focal_length = options.ba_refine_extra_params = options.extract_colors = False
+    options = pipeline_options(pycolmap)
+    options.min_num_matches, options.min_model_size = MIN_MATCHES, 2
     mapper = options.mapper
     mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
     mapper.abs_pose_min_num_inliers, mapper.abs_pose_min_inlier_ratio = MIN_MATCHES, 0.05
     # COLMAP starts with no pair that moved along the optical axis, where a narrow lens sees no depth; a wide one does.
     mapper.init_max_forward_motion = 1.0
-    options.triangulation.ignore_two_view_tracks = False
     models: list[Any] = []
     for first_pair in _TRIES:
         for key, value in first_pair.items():
