@@ -120,6 +120,13 @@ def own_examiner() -> Iterator[None]:
 
 
 @pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures of trajectories are empty files, where a test looks at other files: each takes the better part of a
+    second to draw."""
+    monkeypatch.setattr("spherloc_viz.plots.trajectories.trajectory_png", lambda results, backdrop: b"")
+
+
+@pytest.fixture
 def index(tmp_path: Path) -> Iterator[RunIndex]:
     """An empty list of runs, in a folder where there was none."""
     with RunIndex(tmp_path / "recordings") as index:

@@ -244,6 +244,7 @@ def test_scene_survives_without_the_working_directory(tree, monkeypatch, tmp_pat
     assert load_scene(Path(scene.where)).references[0].path.is_file()
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_the_papers_table_of_a_copy_of_the_dataset(tree, tmp_path):
     """Table II by one command: the sessions that are there, by all of its methods, resumed without a run."""
     found = run_sessions({"kitti360": tree.root}, tmp_path, quick=True)

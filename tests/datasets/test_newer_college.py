@@ -263,6 +263,7 @@ def test_camera_without_its_place_at_the_imu_is_one_sentence(copy):
         load(copy)
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_the_papers_table_of_a_copy_of_the_dataset(copy, tmp_path):
     """Tables IV and V by one command; what the copy has elsewhere is said in the session's scene file."""
     root = copy / "newer-college"

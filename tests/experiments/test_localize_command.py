@@ -194,7 +194,7 @@ def test_a_recording_that_finds_no_room_ends_the_run(tmp_path: Path) -> None:
     assert run(scene, out, records=Records(out / "recordings")) == 0 and None not in read_results(out).recordings
 
 
-@pytest.mark.usefixtures("drawn")
+@pytest.mark.usefixtures("drawn", "no_pictures")
 def test_chosen_queries_first_then_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, out = write_scene(tmp_path, queries=5, few=[3]), tmp_path / "out"
     assert run(scene, out, queries=["0:5:4"]) == 0
@@ -206,7 +206,7 @@ def test_chosen_queries_first_then_the_others(tmp_path: Path, capsys: pytest.Cap
     assert run(scene, out, queries=["0:3"]) == 0
 
 
-@pytest.mark.usefixtures("drawn")
+@pytest.mark.usefixtures("drawn", "no_pictures")
 def test_failures_are_done_again_when_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, out = write_scene(tmp_path, queries=3, broken=[1]), tmp_path / "out"
     assert run(scene, out) == 1
@@ -220,7 +220,7 @@ def test_failures_are_done_again_when_asked(tmp_path: Path, capsys: pytest.Captu
     assert table(out)[0] == first[0]
 
 
-@pytest.mark.usefixtures("drawn")
+@pytest.mark.usefixtures("drawn", "no_pictures")
 def test_a_query_that_has_changed_is_done_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The others stay as they are, and so do results of versions that did not note what they depend on."""
     scene, out = write_scene(tmp_path, queries=3), tmp_path / "out"
@@ -245,7 +245,7 @@ def test_a_query_that_has_changed_is_done_again(tmp_path: Path, capsys: pytest.C
     assert f"true pose of {rows[1]['query']} and 1 more has changed" in told and "1 of 3 queries are done" in told
 
 
-@pytest.mark.usefixtures("drawn")
+@pytest.mark.usefixtures("drawn", "no_pictures")
 def test_what_was_localized_before_is_found(tmp_path: Path) -> None:
     """The newest results of the scene as it is now, without queries that have changed since."""
     path, folder = write_scene(tmp_path, queries=3), tmp_path / "results"
@@ -266,7 +266,7 @@ def test_what_was_localized_before_is_found(tmp_path: Path) -> None:
     assert kept_results(folder, scene, path) is None
 
 
-@pytest.mark.usefixtures("drawn")
+@pytest.mark.usefixtures("drawn", "no_pictures")
 def test_pages_begin_with_the_best_query_that_was_localized_before(tmp_path: Path) -> None:
     """That of most inliers among the localized ones, by the estimator that found it."""
     path, folder = write_scene(tmp_path, queries=3), tmp_path / "results"
@@ -344,7 +344,7 @@ def test_results_of_two_maps_do_not_meet(tmp_path: Path) -> None:
     assert _results_name(tmp_path / "street.toml") == "street"
 
 
-@pytest.mark.usefixtures("drawn")
+@pytest.mark.usefixtures("drawn", "no_pictures")
 def test_a_place_is_doubted_where_another_map_explains_more(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     solvings = {}
@@ -424,7 +424,7 @@ def test_the_picture_shows_truth_errors_and_failures(tmp_path: Path, capsys: pyt
     assert run(write_scene(tmp_path / "none", queries=2, few=[0, 1]), tmp_path / "none" / "out") == 1
 
 
-@pytest.mark.usefixtures("drawn")
+@pytest.mark.usefixtures("drawn", "no_pictures")
 def test_what_other_queries_say_is_written_and_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -461,7 +461,7 @@ def test_what_other_queries_say_is_written_and_told(
     assert compare_sequences({scene: [Solving("mc", (), tmp_path / "mc", None)]}, 0, (), False, tmp_path) == 0
 
 
-@pytest.mark.usefixtures("drawn")
+@pytest.mark.usefixtures("drawn", "no_pictures")
 def test_a_query_that_is_tried_anew_keeps_one_recording(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -491,7 +491,7 @@ def test_a_query_that_is_tried_anew_keeps_one_recording(
     assert f"{second[1].name}: stays, although image1.png was tried anew" in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("drawn")
+@pytest.mark.usefixtures("drawn", "no_pictures")
 def test_several_estimators_and_scenes_in_one_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Each result is that of the estimator alone, and the same command goes on."""
     out, scenes = tmp_path / "both", {}
@@ -524,7 +524,7 @@ def test_several_estimators_and_scenes_in_one_table(tmp_path: Path, capsys: pyte
     assert {path.name for path in (tmp_path / "alike").glob("*.png")} == {"walk_by_day.png", "walk_by_day_2.png"}
 
 
-@pytest.mark.usefixtures("drawn")
+@pytest.mark.usefixtures("drawn", "no_pictures")
 def test_one_query_of_a_scene_can_be_run_alone(tmp_path: Path) -> None:
     scene = write_scene(tmp_path, queries=3, few=[1], timed=True)
 
