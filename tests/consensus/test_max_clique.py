@@ -67,7 +67,7 @@ def test_complete_and_empty_graphs_of_many_nodes():
 
 def test_planted_clique_in_a_geometric_graph(rng):
     """The use it is made for: many balls scattered, and a crowd of them around one position."""
-    for _ in range(20):
+    for _ in range(6):
         scattered = rng.uniform(-5, 5, (300, 3))
         scattered = scattered[np.linalg.norm(scattered, axis=1) > 1.5]
         centres = np.vstack([scattered, rng.normal(0, 0.02, (40, 3))])

@@ -66,7 +66,7 @@ def check_sentence(error, folder):
 
 
 @given(case=damaged())
-@settings(max_examples=250, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_models_are_read_whole_or_refused_with_the_place(case, tmp_path):
     _, files = case
     folder = write(tmp_path, files)

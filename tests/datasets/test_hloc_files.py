@@ -94,7 +94,7 @@ def test_pickles_are_refused_unopened(tmp_path, protocol, name):
     assert not trap.exists()
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(
     st.sampled_from([(read_queries, QUERIES), (read_pairs, PAIRS), (read_results, RESULTS)]).flatmap(
         lambda case: st.tuples(st.just(case[0]), st.one_of(mutations(case[1]), st.binary(max_size=100)))
@@ -286,7 +286,7 @@ def sound(tmp_path_factory):
     return [(folder / f"{libver}.h5").read_bytes() for libver in ("latest", "earliest")]
 
 
-@settings(max_examples=150)
+@settings(max_examples=75)
 @given(st.data())
 def test_flipped_and_truncated_hdf5(folder, sound, data):
     """Numbers, nothing or one sentence; in no case gigabytes, a crash or another exception."""

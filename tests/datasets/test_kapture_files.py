@@ -142,7 +142,7 @@ def test_cameras_that_are_not_supported_are_said(folder):
     assert "'right' are skipped: " in kapture.remarks[0] and "sensors.txt, line 4" in kapture.remarks[0]
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(
     st.sampled_from(sorted(FILES)).flatmap(
         lambda name: st.tuples(st.just(name), st.one_of(mutations(FILES[name]), st.binary(max_size=80)))

@@ -234,7 +234,7 @@ READERS = {
 
 @pytest.mark.parametrize("kind", READERS)
 @given(data=st.data())
-@settings(max_examples=150)
+@settings(max_examples=60)
 def test_any_bytes_are_read_or_refused(folder, kind, data):
     read, sample = READERS[kind]
     path = write(folder, data.draw(st.one_of(mutations(sample), st.binary(max_size=80))), f"fuzz-{kind}")

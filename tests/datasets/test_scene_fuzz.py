@@ -12,7 +12,7 @@ from spherloc.errors import SpherlocError
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
-EXAMPLES = settings(max_examples=120)
+EXAMPLES = settings(max_examples=60)
 
 
 @pytest.fixture(scope="module")
