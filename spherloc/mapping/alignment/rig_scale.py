@@ -38,9 +38,9 @@ MIN_FOR_LEVER = 6
 """Least number of times from which on a lever is fitted."""
 LEVER_SD = 100.0
 """What is known of the lever: a standard deviation in distances of the cameras."""
-SAME, OFF_IF_FIXED = 0.01, 2.0
-"""Where the mapper had the cameras fixed to each other, all times say the same, to the first share of what the cameras
-differ by; the scale then is off by the second number times as much as these tell (``benchmarks.headset``: 1.8)."""
+SAME, OFF_IF_FIXED = 1e-4, 2.0
+"""Where the mapper had the cameras fixed to each other, all times say the same, to the first share of a distance; the
+scale then is off by the second number times as much as they tell (``benchmarks.headset``: 1.8)."""
 ROUNDS = 10
 """Number of times that the scale is fitted to what fits it."""
 
@@ -75,7 +75,7 @@ def scale_by_rig(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScal
     # Of three images that were taken together the third distance tells nothing new, and few times tell little.
     free = sum(len(names) - 1 for names in times)
     relative = float(np.sqrt(len(pairs) / free)) * max(scattered * (1.0 + 5.0 / (len(times) - 1)), steady)
-    if scattered < SAME * steady:
+    if _always_the_same(stated, mapped):
         relative *= OFF_IF_FIXED
     apart = _range_m(np.linalg.norm(stated, axis=1))
     seen = f"images that cameras {apart} apart took together, at {len(times)} times"
@@ -151,6 +151,14 @@ def _between(
         0.5 * (turns[0] + turns[1]) @ way,
         Rotation.from_matrix(turns[1] @ turns[0].T).as_rotvec(),
     )
+
+
+def _always_the_same(stated: FloatArray, mapped: FloatArray) -> bool:
+    """Whether a map has two cameras alike at all times, of ``stated`` (K, 3), which tell the cameras, and ``mapped``
+    (K, 3)."""
+    _, cameras = np.unique(stated, axis=0, return_inverse=True)
+    each = [mapped[cameras == k] for k in range(cameras.max() + 1)]
+    return all(np.ptp(one, axis=0).max() <= SAME * np.linalg.norm(one[0]) for one in each)
 
 
 def _units_per_metre(stated: FloatArray, mapped: FloatArray, turns: FloatArray | None) -> tuple[float, float, float]:
