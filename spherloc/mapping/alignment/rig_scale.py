@@ -95,7 +95,7 @@ def _scale_of_one_moment(poses: Mapping[str, FloatArray], fixed: FixedImages) ->
     if len(inside) < 2:
         raise InputError(f"{none}: fewer than two of its images are in the map.")
     between = [_between(poses, fixed.body_from_camera, pair) for pair in combinations(inside, 2)]
-    stated_m, mapped, turned_rad = (np.array([np.linalg.norm(one[k]) for one in between]) for k in range(3))
+    stated_m, mapped, turned_rad = (np.array([np.linalg.norm(one[k]) for one in between], np.float64) for k in range(3))
     _check_metres(none, stated_m)
     if stated_m.max() <= MIN_BASELINE_M or np.median(turned_rad) > TURNED_RAD:
         raise InputError(_otherwise(none, turned_rad))
