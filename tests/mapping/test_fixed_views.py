@@ -7,6 +7,7 @@ from itertools import product
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 from test_own_calibrations import CAMERAS, as_woodscape
@@ -17,6 +18,7 @@ from spherloc.geometry import camera_centre, inverse_pose, pose, rotation_angle,
 from spherloc.mapping.alignment.fixed_images import fixed_images
 from spherloc.mapping.images.photographs import photographs
 from spherloc.mapping.make import make_map
+from spherloc.mapping.models.fixed_views import freed_if_loose
 from spherloc.mapping.request import MapRequest, ScaleMeasurement
 from spherloc.worlds import build_world
 from spherloc.worlds.render import draw
@@ -112,6 +114,17 @@ def test_fixed_cameras_tie_two_moments(car, tmp_path):
     turn = Rotation.align_vectors(true - true.mean(axis=0), centres - centres.mean(axis=0))[0]
     off = turn.apply(centres - centres.mean(axis=0)) - (true - true.mean(axis=0))
     assert np.linalg.norm(off, axis=1).max() < 0.03
+
+    assert freed_if_loose(pycolmap, made.made) is made.made
+    late = made.made.model.image(made.made.ids["00001_MVL.png"])  # as if it had been taken a moment before
+    before = late.projection_center()
+    cam_from_map = late.cam_from_world().matrix()
+    shifted = pose(cam_from_map[:, :3], cam_from_map[:, 3] + [0.1, 0.0, 0.0])
+    made.made.model.frame(late.frame_id).rig_from_world = pycolmap.Rigid3d(shifted)
+    made.made.model.update_point_3d_errors()
+    freed = freed_if_loose(pycolmap, made.made)
+    assert freed is not made.made
+    assert np.linalg.norm(camera_centre(freed.poses["00001_MVL.png"]) - before) < 0.03
 
 
 def test_a_calibration_of_another_car_places_nothing(car, tmp_path):

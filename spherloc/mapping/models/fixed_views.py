@@ -6,6 +6,7 @@ by three of them, so that nothing ties the lengths of their baselines to each ot
 takes the images of a moment for one: where two moments match in the front camera alone, all others are placed, too.
 """
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -16,12 +17,15 @@ import numpy as np
 from spherloc.frontend.view import View
 from spherloc.geometry import inverse_pose
 from spherloc.mapping.alignment.fixed_images import MIN_BASELINE_M, FixedImages
-from spherloc.mapping.models.later import register, with_images
+from spherloc.mapping.models.later import adjusted, register, with_images
 from spherloc.mapping.models.misplaced import fits
 from spherloc.mapping.models.model import Reconstruction, registered
 from spherloc.mapping.two_view.matched import Matched
 from spherloc.mapping.two_view.pairs import MIN_MATCHES, relative
 from spherloc.mapping.two_view.triangles import Pair, Relative
+
+LOOSE = 0.8
+"""Cameras are not fixed if the mean reprojection error is less than that share where each image moves by itself."""
 
 
 def fixed_pairs(views: Sequence[View], fixed: FixedImages | None) -> dict[Pair, Relative]:
@@ -113,6 +117,17 @@ def with_single_images(pycolmap: Any, matched: Matched, rigs: Any) -> Reconstruc
         made.model.add_point3D(point.xyz, point.track, point.color)
     made.model.update_point_3d_errors()
     return _of_seen(replace(made, poses=poses))
+
+
+def freed_if_loose(pycolmap: Any, made: Reconstruction) -> Reconstruction:
+    """A model of fixed cameras, in which each image has moved by itself if that fits the matches far better: cameras
+    that do not take their images at the same moment do not stand to each other as they are fixed."""
+    free = copy.deepcopy(made.model)
+    adjusted(pycolmap, free)
+    if free.compute_mean_reprojection_error() > LOOSE * made.model.compute_mean_reprojection_error():
+        return made
+    poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in registered(free)}
+    return with_images(replace(made, model=free, poses=poses), {})
 
 
 def _empty(pycolmap: Any, matched: Matched) -> Reconstruction:

@@ -31,7 +31,13 @@ from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.alignment.fixed_images import FixedImages
 from spherloc.mapping.alignment.upright import level_of
 from spherloc.mapping.models.colmap_options import pipeline_options
-from spherloc.mapping.models.fixed_views import fix_cameras, fixed_pairs, placed_by_calibration, with_single_images
+from spherloc.mapping.models.fixed_views import (
+    fix_cameras,
+    fixed_pairs,
+    freed_if_loose,
+    placed_by_calibration,
+    with_single_images,
+)
 from spherloc.mapping.models.joining import joined_by_pairs
 from spherloc.mapping.models.later import with_images
 from spherloc.mapping.models.misplaced import fits, without_misplaced
@@ -153,7 +159,7 @@ def _with_fixed_cameras(
     if fixed is None or fixed.one_moment:
         return ()
     models, _ = _models_of(pycolmap, _UsedPairs(matched, matched.counts()), tell, fixed=fixed)
-    return models
+    return tuple(freed_if_loose(pycolmap, one) for one in models)
 
 
 def _rigid(
