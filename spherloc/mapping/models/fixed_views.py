@@ -19,7 +19,7 @@ from spherloc.geometry import inverse_pose
 from spherloc.mapping.alignment.fixed_images import MIN_BASELINE_M, FixedImages
 from spherloc.mapping.models.later import adjusted, register, with_images
 from spherloc.mapping.models.misplaced import fits
-from spherloc.mapping.models.model import Reconstruction, registered
+from spherloc.mapping.models.model import Reconstruction, poses_of, registered
 from spherloc.mapping.two_view.matched import Matched
 from spherloc.mapping.two_view.pairs import MIN_MATCHES, relative
 from spherloc.mapping.two_view.triangles import Pair, Relative
@@ -111,7 +111,7 @@ def with_single_images(pycolmap: Any, matched: Matched, rigs: Any) -> Reconstruc
     """A model of COLMAP with ``fix_cameras``, with each image in a frame of its own instead, from which it can be
     taken."""
     made = _empty(pycolmap, matched)
-    poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in registered(rigs)}
+    poses = poses_of(rigs)
     register(made, poses)
     for point in rigs.points3D.values():
         made.model.add_point3D(point.xyz, point.track, point.color)
@@ -126,8 +126,7 @@ def freed_if_loose(pycolmap: Any, made: Reconstruction) -> Reconstruction:
     adjusted(pycolmap, free)
     if free.compute_mean_reprojection_error() > LOOSE * made.model.compute_mean_reprojection_error():
         return made
-    poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in registered(free)}
-    return with_images(replace(made, model=free, poses=poses), {})
+    return with_images(replace(made, model=free, poses=poses_of(free)), {})
 
 
 def _empty(pycolmap: Any, matched: Matched) -> Reconstruction:

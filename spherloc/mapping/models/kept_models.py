@@ -21,7 +21,7 @@ from spherloc.frontend.features import VERSION
 from spherloc.frontend.pipeline import FrontendOptions
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.alignment.fixed_images import FixedImages
-from spherloc.mapping.models.model import Reconstruction
+from spherloc.mapping.models.model import Reconstruction, poses_of
 from spherloc.mapping.rig import shots_of
 from spherloc.registry import require
 
@@ -123,10 +123,7 @@ def _read(folder: Path, key: str) -> tuple[Reconstruction, ...] | None:
 
 def _one(pycolmap: Any, model: Path, told: dict[str, Any], database: Path, ids: dict[str, int]) -> Reconstruction:
     read = pycolmap.Reconstruction(str(model))
-    poses = {
-        image.name: np.asarray(image.cam_from_world().matrix())
-        for image in (read.image(number) for number in read.reg_image_ids())
-    }
+    poses = poses_of(read)
     with np.load(model / _COUNTS, allow_pickle=False) as counts:
         matches, all_matches = counts["matches"], counts["all_matches"]
     return Reconstruction(

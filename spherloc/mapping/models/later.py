@@ -22,7 +22,7 @@ from spherloc.mapping.alignment.fixed_images import FixedImages
 from spherloc.mapping.alignment.rig_poses import expected_by_calibration
 from spherloc.mapping.alignment.upright import Level, arbitrary_scale
 from spherloc.mapping.models.colmap_options import pipeline_options
-from spherloc.mapping.models.model import Reconstruction, SeenPoints, contradictions, points_of
+from spherloc.mapping.models.model import Reconstruction, SeenPoints, contradictions, points_of, poses_of
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.rig import expected_poses, shots_of
 from spherloc.outcome import Outcome, judge
@@ -178,11 +178,7 @@ def _with(made: Reconstruction, placed: Mapping[str, _Placed], adjust: bool = Tr
         model = pycolmap.triangulate_points(model, database, folder, folder, False, options, refine_intrinsics=False)
     if adjust:
         adjusted(pycolmap, model)
-    poses = {
-        image.name: np.asarray(image.cam_from_world().matrix())
-        for image in (model.image(number) for number in model.reg_image_ids())
-    }
-    return replace(made, model=model, poses=poses).judged()
+    return replace(made, model=model, poses=poses_of(model)).judged()
 
 
 def register(made: Reconstruction, poses: Mapping[str, FloatArray]) -> None:

@@ -303,6 +303,11 @@ def panoramas_of(model: Any) -> set[str]:
     return {image.name for image in registered(model) if image.camera.model.name == "EQUIRECTANGULAR"}
 
 
+def poses_of(model: Any) -> dict[str, FloatArray]:
+    """Poses (3, 4) from a model's frame of the images that have one, by name."""
+    return {image.name: np.asarray(image.cam_from_world().matrix()) for image in registered(model)}
+
+
 def registered(model: Any) -> list[Any]:
     """The images of a model that have a pose."""
     return [model.image(number) for number in model.reg_image_ids()]

@@ -41,7 +41,7 @@ from spherloc.mapping.models.fixed_views import (
 from spherloc.mapping.models.joining import joined_by_pairs
 from spherloc.mapping.models.later import with_images
 from spherloc.mapping.models.misplaced import fits, without_misplaced
-from spherloc.mapping.models.model import Reconstruction, parted, registered, untangled, worth
+from spherloc.mapping.models.model import Reconstruction, parted, poses_of, untangled, worth
 from spherloc.mapping.models.pair_evidence import PairEvidence
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.rig import Shots, joint_of, one_camera, shots_of, went_apart, with_ties
@@ -222,9 +222,8 @@ def _models_of(
     found, cut = list[Reconstruction](), set[Names]()
     for model in models:
         if fixed is None:
-            poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in registered(model)}
             every = counts + matched.same_place
-            placed = Reconstruction(model, poses, counts, (), every, matched.database, matched.ids)
+            placed = Reconstruction(model, poses_of(model), counts, (), every, matched.database, matched.ids)
         else:
             placed = with_single_images(pycolmap, matched, model)
         whole = without_misplaced(placed, agreeing)

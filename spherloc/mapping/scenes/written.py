@@ -15,7 +15,7 @@ from spherloc.mapping.advice import advice
 from spherloc.mapping.alignment.stated_gravity import StatedGravity
 from spherloc.mapping.alignment.true_poses import AlignedTruth, aligned_truth
 from spherloc.mapping.alignment.upright import Level, MapScale, upright_frame
-from spherloc.mapping.models.model import Reconstruction, registered
+from spherloc.mapping.models.model import Reconstruction, poses_of, registered
 from spherloc.mapping.scenes.new_images import NewImages
 from spherloc.mapping.scenes.scene_files import (
     GRAVITY,
@@ -88,10 +88,7 @@ def write_map(
     pycolmap = require("pycolmap", "colmap", "making a map")
     turn = pycolmap.Rotation3d(upright_frame(level))
     made.model.transform(pycolmap.Sim3d(scale.metres_per_unit, turn, np.zeros(3)))
-    poses = {
-        image.name: np.asarray(image.cam_from_world().matrix())
-        for image in (made.model.image(number) for number in made.model.reg_image_ids())
-    }
+    poses = poses_of(made.model)
     names = [view.name for view in views if view.name in poses]
     head = MapHead(
         _name(images, scale),
