@@ -10,7 +10,7 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.geometry import camera_centre, pose, so3_exp, transform, yaw_rotation
 from spherloc.mapping.models import reconstruction
 from spherloc.mapping.models.joining import joined_by_pairs
-from spherloc.mapping.models.model import Reconstruction
+from spherloc.mapping.models.model import Reconstruction, untangled
 from spherloc.mapping.models.pair_evidence import PairEvidence, distance_of
 from spherloc.mapping.two_view.matched import Matched, _camera_in
 from tests.mapping.test_rig import in_another_frame
@@ -238,3 +238,10 @@ def test_a_model_without_points_is_none(monkeypatch, tmp_path):
     monkeypatch.setattr(reconstruction, "_mapped", mapped)
     assert reconstruction._models(pycolmap, tmp_path / "matches.db", tmp_path, 3, lambda *_: None) == []
     assert tried == [50, 25, 15]
+
+
+def test_two_maps_of_the_same_images_are_one(rooms):
+    rooms.matched()
+    first, second = (rooms.model_of("a", scale, np.eye(3)) for scale in (1.0, 2.0))
+    (left,) = untangled([first, second])
+    assert left.poses == first.poses

@@ -184,7 +184,7 @@ def untangled(made: Sequence[Reconstruction]) -> tuple[Reconstruction, ...]:
     """The models without images that have more matches with those of another one, the largest first.
 
     Models that share images and yet could not be joined take two places for one somewhere. A shared image belongs to
-    the model with which it has most matches.
+    the model with which it has most matches, of those alike to the first.
     """
     if len(made) < 2:
         return tuple(made)
@@ -197,8 +197,9 @@ def untangled(made: Sequence[Reconstruction]) -> tuple[Reconstruction, ...]:
             ties = [
                 int(made[0].all_matches[place[name], [place[one] for one in group - {name}]].sum()) for group in members
             ]
-            for group, tie in zip(members, ties, strict=True):
-                if name in group and tie < max(ties):
+            held = [group for group, tie in zip(members, ties, strict=True) if tie == max(ties) and name in group]
+            for group in members:
+                if name in group and group is not next(iter(held), None):
                     group.remove(name)
                     changed = True
     left = [one.without(one.poses.keys() - group) for one, group in zip(made, members, strict=True) if len(group) > 1]

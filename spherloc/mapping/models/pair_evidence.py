@@ -73,7 +73,7 @@ class PairEvidence:
             )
             for (one, other), found in {**matched.unsure, **matched.verified}.items()
         ]
-        self._bearings, self._cameras = matched.bearings, matched.cameras
+        self.bearings, self._cameras = matched.bearings, matched.cameras
         self.panoramas = all(isinstance(camera, Equirectangular) for camera in matched.cameras.values())
         """Whether all images see all around."""
         self._matches, self._bound_rad = matched.matches(), matched.bound_rad
@@ -110,7 +110,7 @@ class PairEvidence:
             (image.points2D[one], other) for one, other in pair.matches.tolist() if image.points2D[one].has_point3D()
         ]
         points = np.array([made.model.point3D(point.point3D_id).xyz for point, _ in seen]).reshape(-1, 3)
-        rays = self._bearings[second][[other for _, other in seen]]
+        rays = self.bearings[second][[other for _, other in seen]]
         return distance_of(transform(made.poses[first], points), rays, pair.rotation, pair.direction)
 
     def least_holding(self, poses: Mapping[str, FloatArray]) -> int:
@@ -149,7 +149,7 @@ class PairEvidence:
             found = self._matches[second, first][:, ::-1]
         else:
             found = self._matches.get((first, second), np.empty((0, 2), np.int64))
-        return self._bearings[first][found[:, 0]], self._bearings[second][found[:, 1]]
+        return self.bearings[first][found[:, 0]], self.bearings[second][found[:, 1]]
 
     def _fit(self, poses: Mapping[str, FloatArray], pair: Names) -> tuple[int, BoolArray]:
         """How many more matches of two images fit their poses than do by chance, 0 if no more, and which (M,) fit."""
@@ -189,6 +189,12 @@ def distance_of(points: FloatArray, rays: FloatArray, rotation: FloatArray, dire
     (3, 3) and the unit ``direction`` (3,) are those of the second camera from the first: each point X gives the
     distance d for which its bearing is parallel to R X + d t.
     """
+    return agreed_distance(np.log(distances_of(points, rays, rotation, direction)))
+
+
+def distances_of(points: FloatArray, rays: FloatArray, rotation: FloatArray, direction: FloatArray) -> FloatArray:
+    """How far (T,) a second camera is from a first one by each of the points (K, 3) that tell it, with the arguments of
+    ``distance_of``."""
     turned = points @ rotation.T
     along = np.cross(rays, direction)
     strength = np.maximum(np.linalg.norm(along, axis=1), 1e-9)
@@ -196,7 +202,11 @@ def distance_of(points: FloatArray, rays: FloatArray, rotation: FloatArray, dire
     moved = turned + distances[:, None] * direction
     spread = NOISE_RAD * np.linalg.norm(moved, axis=1) / strength
     telling = (distances > 0.0) & (spread < MAX_SPREAD * distances) & (np.sum(moved * rays, axis=1) > 0.0)
-    logs = np.log(distances[telling])
+    return distances[telling]
+
+
+def agreed_distance(logs: FloatArray) -> float | None:
+    """The distance on which enough of those with these logarithms (T,) agree; None if there is none."""
     if len(logs) < MIN_AGREEING:
         return None
     agree = np.abs(logs[:, None] - logs) <= WINDOW

@@ -43,6 +43,7 @@ from spherloc.mapping.models.later import with_images
 from spherloc.mapping.models.misplaced import fits, without_misplaced
 from spherloc.mapping.models.model import Reconstruction, parted, poses_of, untangled, worth
 from spherloc.mapping.models.pair_evidence import PairEvidence
+from spherloc.mapping.models.part_scales import with_one_scale
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.rig import Shots, joint_of, one_camera, shots_of, went_apart, with_ties
 from spherloc.mapping.two_view.matched import Matched, Names, match_all
@@ -227,6 +228,8 @@ def _models_of(
         else:
             placed = with_single_images(pycolmap, matched, model)
         whole = without_misplaced(placed, agreeing)
+        if evidence is not None:
+            whole = with_one_scale(whole, evidence)
         if len(whole.poses) > 1:
             parts, misplaced = _parts(whole.judged(), evidence)
             cut |= _cut(whole, parts, {pair: one for pair, one in rotations.items() if pair not in misplaced})
