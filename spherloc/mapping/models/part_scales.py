@@ -185,7 +185,7 @@ class _Seen:
         matrices, sums = np.tile(1e-9 * np.eye(3), (self._count, 1, 1)), np.zeros((self._count, 3))
         np.add.at(matrices, self._point[used], across)
         np.add.at(sums, self._point[used], np.einsum("kij,kj->ki", across, centres))
-        return np.linalg.solve(matrices, sums[:, :, None])[:, :, 0]
+        return np.asarray(np.linalg.solve(matrices, sums[:, :, None]), np.float64)[:, :, 0]
 
 
 def _others(names: Names, name: str) -> list[str]:
