@@ -67,7 +67,7 @@ def sequence_text(results: SequenceResults, summary: Summary, scene: MapScene) -
         for line in (*_skipped(summary), *_each(results, scene), *_without_pose(results.rows), *_remarks(results.rows))
     ]
     if not timed(results):
-        lines.append("  trajectory: times are places in the sequence, as the queries' times do not grow from each to the next")
+        lines.append("  trajectory: times are places in the sequence, as those of the queries do not always grow")
     if (picture := results.folder / PICTURE).exists():
         lines.append(f"  picture: {picture}")
     return "\n".join([*lines, f"  written to {results.folder}"])
