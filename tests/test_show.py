@@ -21,7 +21,7 @@ import spherloc
 import spherloc_viz
 from spherloc.errors import InputError
 from spherloc_viz.showing import Playground
-from tests.browser.playground import FLAGS, PATIENCE_MS, find_chromium
+from tests.browser.playground import FLAGS, PATIENCE_MS, blind_page, find_chromium
 from tests.browser.playground import Playground as Tab
 from tests.waiting import until
 
@@ -104,7 +104,7 @@ def notebook(playground: Playground) -> Iterator[int]:
 def test_a_notebook_shows_it_inline_and_no_other_site_can(
     found: spherloc.Localization, playground: Playground, browser: Browser
 ) -> None:
-    page = browser.new_page()
+    page = blind_page(browser)
     with notebook(playground) as port:
         page.goto(f"http://localhost:{port}/lab")
         inliers = page.frame_locator("iframe").locator("//tr[td[1][normalize-space()='inliers']]/td[2]")
@@ -112,7 +112,7 @@ def test_a_notebook_shows_it_inline_and_no_other_site_can(
         assert page.get_by_role("link").get_attribute("href") == playground.url
         with page.expect_console_message(lambda message: "frame-ancestors" in message.text):
             page.goto(f"http://127.0.0.2:{port}/")  # no address that notebooks of this machine have
-    page.close()
+    page.context.close()
 
 
 SCRIPT = """

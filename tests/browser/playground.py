@@ -127,6 +127,13 @@ def served(*words: str | Path, packages: Path | None = None) -> Iterator[tuple[s
             raise
 
 
+def blind_page(browser: Browser) -> Page:
+    """A page in a context of its own, whose canvas draws nothing."""
+    context = browser.new_context(viewport=SIZE, reduced_motion="reduce")  # pyright: ignore[reportArgumentType]
+    context.add_init_script(BLIND)
+    return context.new_page()
+
+
 _spare_pages: WeakKeyDictionary[Browser, list[Page]] = WeakKeyDictionary()
 """Pages of each browser that no test uses, all with the usual scripts."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from playground import SCENE, Playground, served
+from playground import SCENE, Playground, blind_page, served
 from playwright.sync_api import Browser, Locator, Page, expect
 
 from spherloc.estimators import estimate
@@ -228,7 +228,7 @@ def visible_nodes(page: Page) -> dict[str, int]:
 
 def check_page(browser: Browser, path: Path, shown: dict[str, int]) -> None:
     """The file opens from the disk, asks for nothing, and has what the canvas had."""
-    page = browser.new_context().new_page()
+    page = blind_page(browser)
     asked: list[str] = []
     errors: list[str] = []
     page.on("request", lambda request: asked.append(request.url))

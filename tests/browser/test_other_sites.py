@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
-from playground import Playground
+from playground import Playground, blind_page
 from playwright.sync_api import Browser, Page
 
 OPEN_SOCKET = """address => new Promise(done => {
@@ -79,7 +79,7 @@ def test_nothing_leaves_the_page(tab: Playground, address: str) -> None:
 
 
 def test_a_link_cannot_bring_a_foreign_scene(browser: Browser, address: str) -> None:
-    page = browser.new_context().new_page()
+    page = blind_page(browser)
     page.goto(f"{address}/?playbackPath=data:application/octet-stream;base64,AAAA&websocket=ws://127.0.0.1:9")
     assert page.url == f"{address}/"
     page.context.close()

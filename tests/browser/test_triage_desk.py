@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playground import FLAGS, PATIENCE_MS, SCENE, find_chromium, served
+from playground import BLIND, FLAGS, PATIENCE_MS, SCENE, find_chromium, served
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 from test_accessibility import RULES
 
@@ -61,7 +61,9 @@ class Desk:
 
     def __init__(self, browser: Browser, home: str, path: str = "/desk") -> None:
         size: Any = {"width": 1280, "height": 720}
-        self.page: Page = browser.new_context(viewport=size, accept_downloads=True).new_page()
+        context = browser.new_context(viewport=size, accept_downloads=True)
+        context.add_init_script(BLIND)  # of the playground that a run opens in
+        self.page: Page = context.new_page()
         self.page.set_default_timeout(PATIENCE_MS)
         self.errors: list[str] = []
         self.page.on("console", lambda message: self.errors.append(message.text) if message.type == "error" else None)
