@@ -90,10 +90,11 @@ def test_a_match_that_is_selected_anywhere_lights_up_everywhere(tab: Playground,
     expect_lit(tab, (other + 1) % 40)
     tab.touch("deselect:").click()
     expect_lit(tab)
+    bins_arcs_and_rectangles_select_several(tab, trace)
     tab.expect_quiet(address)
 
 
-def test_bins_arcs_and_rectangles_select_several(tab: Playground, trace: Trace, address: str) -> None:
+def bins_arcs_and_rectangles_select_several(tab: Playground, trace: Trace) -> None:
     tab.tab("Residuals")
     bins = tab.page.locator("rect.bin[data-touch*=':px:']")
     expect(bins.first).to_be_visible()
@@ -136,7 +137,6 @@ def test_bins_arcs_and_rectangles_select_several(tab: Playground, trace: Trace, 
     tab.page.mouse.up()
     tab.page.keyboard.up("Shift")
     tab.until(lambda: tab.lit() == inside, f"the rectangle selects {inside}")
-    tab.expect_quiet(address)
 
 
 def outcome(tab: Playground) -> dict[str, str]:
