@@ -61,11 +61,11 @@ def alive(pid: int) -> bool:
 
 
 def test_rows_are_those_of_direct_calls_though_a_worker_is_killed(tmp_path: Path) -> None:
-    plan = small_plan(tmp_path, runs=12)
+    plan = small_plan(tmp_path, runs=6)
     given: list[SweepRow] = []
     for row in run_sweep(plan, workers=2):
         given.append(row)
-        if len(given) == 12:
+        if len(given) == 6:
             pid = multiprocessing.active_children()[0].pid
             assert pid is not None
             own = os.getpriority(os.PRIO_PROCESS, 0)
@@ -73,8 +73,8 @@ def test_rows_are_those_of_direct_calls_though_a_worker_is_killed(tmp_path: Path
             os.kill(pid, signal.SIGKILL)
     assert not multiprocessing.active_children()
     rows = untimed(given)
-    assert len(rows) == plan.rows == 48
-    assert {seed for _, _, seed in rows} == set(range(3, 15)), "all estimators and values get the same problems"
+    assert len(rows) == plan.rows == 24
+    assert {seed for _, _, seed in rows} == set(range(3, 9)), "all estimators and values get the same problems"
     scene = load_scene(tmp_path / "tiny.toml")
     for (label, value, seed), row in rows.items():
         name = label.split()[0]
@@ -98,7 +98,7 @@ def test_rows_are_those_of_direct_calls_though_a_worker_is_killed(tmp_path: Path
         assert (row.upper_bound, row.lower_bound) == bounds
         assert (name == "mc-exact") == (proven is not None)
     assert 0 < sum(row.success for row in rows.values()) < plan.rows
-    done = [key for place, key in enumerate(rows) if place % 12]
+    done = [key for place, key in enumerate(rows) if place % 6]
     backlog = Backlog(plan, done)
     again: list[SweepRow] = []
     while jobs := backlog.take():
@@ -277,7 +277,7 @@ def test_an_impossible_run_is_named(tmp_path: Path) -> None:
 
 
 def test_a_cluster_gives_the_same_rows_though_a_worker_is_killed(tmp_path: Path) -> None:
-    plan = small_plan(tmp_path, runs=20)
+    plan = small_plan(tmp_path, runs=12)
     rows: list[SweepRow] = []
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
@@ -285,7 +285,7 @@ def test_a_cluster_gives_the_same_rows_though_a_worker_is_killed(tmp_path: Path)
         pids = [worker.pid for worker in cluster.workers.values()]
         for row in run_sweep(plan, scheduler=cluster.scheduler_address):
             rows.append(row)
-            if len(rows) == 20:
+            if len(rows) == 12:
                 os.kill(pids[0], signal.SIGKILL)
         worker_address = list(cluster.workers.values())[1].worker_address
         with pytest.raises(InputError, match="it is not a scheduler"):
@@ -293,7 +293,7 @@ def test_a_cluster_gives_the_same_rows_though_a_worker_is_killed(tmp_path: Path)
     assert not alive(pids[0])
     found = untimed(rows)
     assert len(found) == plan.rows
-    few = [Job(run, value, entrant) for run in (0, 19) for value in (0, 1) for entrant in (0, 1)]
+    few = [Job(run, value, entrant) for run in (0, 11) for value in (0, 1) for entrant in (0, 1)]
     assert untimed(plan.solve(few)).items() <= found.items()
 
 
