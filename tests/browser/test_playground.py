@@ -89,10 +89,11 @@ def test_steps_say_and_draw_what_the_core_computes(tab: Playground, tmp_path: Pa
             expect(tab.thumb("Timeline")).to_have_attribute("aria-valuenow", str(number + 1))
         else:
             tab.slide("Timeline", "ArrowRight")
+    the_exact_estimator_says_what_is_proven_and_options_change_a_run(tab)
     tab.expect_quiet(address)
 
 
-def test_the_exact_estimator_says_what_is_proven_and_options_change_a_run(tab: Playground) -> None:
+def the_exact_estimator_says_what_is_proven_and_options_change_a_run(tab: Playground) -> None:
     tab.choose("Estimator", EXACT)
     expect(tab.value("estimator")).to_have_text("mc-exact")
     proven = re.compile(r"^Proven optimal: no pose explains more than (1[89]|2[0-2])$")
@@ -118,7 +119,6 @@ def test_the_exact_estimator_says_what_is_proven_and_options_change_a_run(tab: P
     tab.type("Iterations", "1")
     expect(tab.page.get_by_text(re.compile(r"(no pose|failure|success)")).first).to_be_visible()
     tab.until(lambda: tab.step_count() < 15, "one sample makes few steps")
-    assert tab.errors == []
 
 
 def test_gravity_can_be_off_and_scene_and_camera_be_changed(tab: Playground) -> None:
