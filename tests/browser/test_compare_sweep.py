@@ -176,7 +176,7 @@ def test_compare(page: Playground, scene: Path) -> None:
     assert tab.errors == []
 
 
-def test_a_comparison_is_cancelled(page: Playground) -> None:
+def test_a_comparison_is_cancelled_and_a_slow_run_gives_way(page: Playground) -> None:
     tab = page
     tab.tab("Compare")
     tick_only(tab, "compare", ("ransac-2p", "patient"))
@@ -189,6 +189,8 @@ def test_a_comparison_is_cancelled(page: Playground) -> None:
     tick_only(tab, "compare", ("mc",))
     tab.press("Compare")
     tab.until(lambda: list(compared_rows(tab)) == ["mc"], "a comparison can follow")
+    tab.tab("Play")
+    shows_progress_and_gives_way(tab)
     assert tab.errors == []
 
 
@@ -198,8 +200,8 @@ def bar(tab: Playground) -> float | None:
     return next(iter(tab.page.get_by_role("progressbar").locator("visible=true").evaluate_all(script)), None)
 
 
-def test_a_slow_run_shows_progress_and_gives_way(page: Playground) -> None:
-    tab = page
+def shows_progress_and_gives_way(tab: Playground) -> None:
+    """A slow run."""
     cancel = tab.page.get_by_role("button", name="Cancel", exact=True)
     tab.choose("Estimator", "patient")
     expect(cancel).to_be_visible()
@@ -223,7 +225,6 @@ def test_a_slow_run_shows_progress_and_gives_way(page: Playground) -> None:
     tab.choose("Estimator", RANSAC)
     expect(tab.value("estimator")).to_have_text("ransac-2p")
     expect(cancel).to_be_hidden()
-    assert tab.errors == []
 
 
 def workers(server: int) -> set[int]:
