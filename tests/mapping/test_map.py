@@ -189,23 +189,26 @@ def test_gravity_that_a_file_states_goes_before_that_of_lines(walk, tmp_path):
 
 
 def test_one_command_localizes_new_photographs(walk, tmp_path, monkeypatch, capsys):
-    """Those of the map itself; the same command again finds them done, and a map in metres of its own has its own."""
+    """Two of the map itself; the same command again finds them done, and a map in metres of its own has its own."""
     _, found, *_, output = walk
-    images = found.views[0].path.parent
+    images, new = found.views[0].path.parent, tmp_path / "new"
+    new.mkdir()
+    for view in found.views[:2]:
+        shutil.copy(view.path, new)
     shutil.copytree(output, tmp_path / "map")
     monkeypatch.chdir(tmp_path)
-    given = {"output": Path("map"), "localize": images, "nadir": 12.0, "features": "sift"}
-    results = Path("recordings") / f"map_{images.name}_auto_0"
+    given = {"output": Path("map"), "localize": new, "nadir": 12.0, "features": "sift"}
+    results = Path("recordings") / "map_new_auto_0"
     assert map_command(images, distance=("reference_002.png", "reference_003.png", "3"), **given) == 0
     told = capsys.readouterr().out
-    assert "5 of 5 queries are localized" in told and f"written to {results}" in told
+    assert "2 of 2 queries are localized" in told and f"written to {results}" in told
     (place,) = (line for line in told.splitlines() if line.startswith("  reference_002.png: localized, at ("))
-    assert "3 m from reference_003.png" in place and re.search(r", \d+ of \d+ matches agree", place)
-    assert told.splitlines()[-1] == f"see it        spherloc play {Path('map') / images.name}.toml"
-    assert len(list((results / "recordings").glob("*.rrd"))) == 5
+    assert "3 m from reference_003.png" in place and re.search(r", [\d,]+ of [\d,]+ matches agree", place)
+    assert told.splitlines()[-1] == f"see it        spherloc play {Path('map') / 'new'}.toml"
+    assert len(list((results / "recordings").glob("*.rrd"))) == 2
     assert map_command(images, **given) == 0
     told = capsys.readouterr()
-    assert f"{results}: 5 of 5 queries are done already" in told.err and "see it" in told.out
+    assert f"{results}: 2 of 2 queries are done already" in told.err and "see it" in told.out
     assert map_command(images, distance=("reference_002.png", "reference_003.png", "6"), **given) == 0
     told = capsys.readouterr()
     assert f"those of this one go to {results}_2" in told.err and f"written to {results}_2" in told.out
@@ -389,7 +392,7 @@ def test_a_scale_that_was_given_in_millimetres_is_doubted(walk):
 
 @pytest.fixture(scope="module")
 def rig(walk, tmp_path_factory):
-    """Two fisheyes at each place of the walk, cut from its panorama, one looking a right angle to the left."""
+    """Two fisheyes at four places of the walk, cut from its panoramas, one looking a right angle to the left."""
     poses, panoramas, *_ = walk
     folder, cut = tmp_path_factory.mktemp("rig"), {}
     front = KannalaBrandt(480, 480, 150.0, 150.0, 240.0, 240.0, (0.0, 0.0, 0.0, 0.0))
@@ -398,7 +401,7 @@ def rig(walk, tmp_path_factory):
         (folder / name).mkdir()
         (folder / f"{name}.toml").write_text(camera_file(camera))
         panorama_from_camera = so3_exp(np.array([0.0, turn_rad, 0.0]))
-        for view in panoramas.views:
+        for view in panoramas.views[:4]:
             cv2.imwrite(str(folder / name / view.name), cut_out(view, camera, panorama_from_camera))
             cut[f"{name}/{view.name}"] = panorama_from_camera.T @ poses[view.name]
     return folder, cut
@@ -409,7 +412,7 @@ def test_a_map_of_the_cameras_of_a_rig(rig, tmp_path):
     found = photographs(folder, {})
     made = make_map(MapRequest(found.views, folder), tmp_path)
     names = sorted(made.written.poses)
-    assert len(names) >= 8 and len({name.partition("/")[0] for name in names}) == 2
+    assert len(names) >= 6 and len({name.partition("/")[0] for name in names}) == 2
     first = names[0]
     for name in names[1:]:
         turn = made.written.poses[name][:, :3] @ made.written.poses[first][:, :3].T
