@@ -249,16 +249,15 @@ provenance = "spherloc"
 world = "apartment"
 [camera]
 model = "kannala_brandt"
-width = 360
-height = 360
-fx = 128.5
-fy = 128.5
-cx = 176.5
-cy = 182.5
+width = 420
+height = 420
+fx = 150.0
+fy = 150.0
+cx = 206.0
+cy = 213.0
 distortion = [-0.0416667, 0.00052083, 0.0, 0.0]
 [references]
-count = 10
-stop = 0.6
+count = 14
 [queries]
 count = 1
 start = 0.5
@@ -282,8 +281,8 @@ def test_a_lens_is_found_by_images(tmp_path, monkeypatch):
         return fitted[-1][1]
 
     monkeypatch.setattr(unknown_lens, "fit_lens", fits)
-    camera, remark, untold = find_lens(images, (360, 360), lambda kind, done, count: stages.append((kind, done, count)))
-    radii = np.linspace(0.0, 170.0, 10)
+    camera, remark, untold = find_lens(images, (420, 420), lambda kind, done, count: stages.append((kind, done, count)))
+    radii = np.linspace(0.0, 200.0, 10)
     assert np.degrees(np.abs(angles(camera, radii) - angles(true, radii)).max()) < 1.5
     assert abs(camera.cx - true.cx) < 4 and abs(camera.cy - true.cy) < 4
     assert re.fullmatch(
@@ -298,7 +297,7 @@ def test_a_lens_is_found_by_images(tmp_path, monkeypatch):
         "fits of the lens to the matches",
     ]
     assert not untold
-    find_lens(images, (360, 360), lambda *_: None)
+    find_lens(images, (420, 420), lambda *_: None)
     (first, _), (again, _) = fitted
     for one, other in zip(first, again, strict=True):  # and so what is done is used again
         np.testing.assert_array_equal(one, other)
