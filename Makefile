@@ -33,7 +33,7 @@ test: ## Install what the tests need, a Chromium included, and run them all
 	@SPHERLOC_CHROMIUM="$$(scripts/setup.sh test)" && export SPHERLOC_CHROMIUM && \
 	  printf 'spherloc: running the tests; browser: %s\n' "$$SPHERLOC_CHROMIUM" && \
 	  $(BIN)/python -c 'from spherloc.warm_up import warm_up; warm_up(lambda said: print("spherloc:", said))' && \
-	  exec $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder $(ARGS)
+	  exec $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-python: ## Run part of the tests with a newer Python (3.12, 3.13), if one is here
 	@scripts/test_python.sh $(if $(findstring command,$(origin PYTHON)),'$(PYTHON)')
