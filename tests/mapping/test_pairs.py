@@ -165,6 +165,20 @@ def test_a_pose_is_sure_if_no_other_direction_has_nearly_as_many_matches(rng, ca
     assert bool(pair.sureness(0, 1, matches, geometry) < SURE) is unsure
 
 
+@pytest.mark.parametrize("by_sift", [True, False])
+def test_matches_of_sift_alone_may_show_that_it_is_no_thing_that_stands_at_two_places(rng, tmp_path, by_sift):
+    """LightGlue finds more matches on such a thing, so that of its own far more must fit."""
+    right, count, second = 80, 200, pose(yaw_rotation(0.3), [0.5, 0.0, 0.2])
+    shelf = rng.uniform([-1.5, -1.0, 3.0], [1.5, 1.0, 5.0], (right, 3))
+    here = np.concatenate([shelf, around(rng, count - right, -60.0, 60.0)])
+    there = np.concatenate([transform(second, shelf), around(rng, count - right, -60.0, 60.0)])
+    lightglue = MatchOptions("lightglue", weights=tmp_path / "none.onnx")
+    pair = two_images(rng, here, there, 2, lightglue, {(0, 1)})
+    geometry = pair._estimated(0, 1, np.tile(np.arange(right, dtype=np.uint32)[:, None], 2))
+    matches = np.tile(np.arange(0 if by_sift else right, 2 * count, dtype=np.uint32)[:, None], 2)
+    assert bool(pair.sureness(0, 1, matches, geometry) < SURE) is not by_sift
+
+
 def test_lightglue_matches_promising_pairs_only(rng, tmp_path):
     """Of others, the features of the first kind are matched by nearest neighbours."""
     here, there, second = street(rng, 100, 0)

@@ -110,6 +110,10 @@ class ImagePairs:
         self._pixels = [sphere.project(rays)[0] for rays in self.bearings]
         self._words = [_unit(one.descriptors[index]) for one, index in zip(features, usable, strict=True)]
         self._gravity = gravity
+        self._of_first_kind = [
+            index < (len(one.parts[0]) if one.parts else 0) for one, index in zip(features, usable, strict=True)
+        ]
+        """(K,) which of them are of the first of joined kinds."""
         self._number_of = [np.full(len(found), -1) for found in features]
         for numbers, index in zip(self._number_of, usable, strict=True):
             numbers[index] = np.arange(len(index))
@@ -193,7 +197,8 @@ class ImagePairs:
         """How sure a pose is; it should be ``SURE``.
 
         Infinity if a calibration tells it. Of panoramas 0 or infinity: whether what fits of the matches (M, 2) may be a
-        thing that stands at two places, or a place that looks alike. Of others the number of those that fit, times the
+        thing that stands at two places, or a place that looks alike; of joined kinds of features the first alone may
+        show that it is none. Of others the number of those that fit, times the
         cube of the peak, or times what makes ``MANY_SURE`` sure.
         """
         if self.is_as_fixed((first, second), geometry):
@@ -202,9 +207,13 @@ class ImagePairs:
         fits = fitting(*rays, *pose, self.bound_rad)
         count, cameras = np.count_nonzero(fits), (self._cameras[first], self._cameras[second])
         if all(isinstance(camera, Equirectangular) for camera in cameras):
-            many = MANY_FIT_LEARNED if self._learned(first, second) else MANY_FIT
             clear = count >= MANY_FIT_PEAK or self.peak(first, second, pose) >= PEAK
-            return 0.0 if fit_on_one_thing(cameras, rays, fits, many) or not clear else np.inf
+            learned = self._learned(first, second)
+            one_thing = fit_on_one_thing(cameras, rays, fits, MANY_FIT_LEARNED if learned else MANY_FIT)
+            if one_thing and learned:
+                own = fits & self._of_first_kind[first][pairs[:, 0]] & self._of_first_kind[second][pairs[:, 1]]
+                one_thing = np.count_nonzero(own) < MIN_MATCHES or fit_on_one_thing(cameras, rays, own, MANY_FIT)
+            return 0.0 if one_thing or not clear else np.inf
         return count * max(self.peak(first, second, pose) ** 3, SURE / MANY_SURE)
 
     def peak(self, first: int, second: int, pose: Relative) -> float:
