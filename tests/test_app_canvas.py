@@ -9,6 +9,8 @@ import pytest
 import viser
 from test_app_views import box, glb
 
+from spherloc.datasets import bundled_scenes, load_scene
+from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.synthetic import SyntheticScene
 from spherloc.estimators import default_options, estimate
 from spherloc_viz.app.catalog import Run, RunRequest, SceneRequest
@@ -131,6 +133,22 @@ def test_a_view_that_a_link_asked_for_stays_in_the_link_while_a_page_is_built(
     assert shown.viewpoint() == asked
     stand((2.0, -2.0, -5.0))
     assert shown.viewpoint()[:3] == (2.0, -2.0, -5.0)
+
+
+def test_a_page_that_was_still_being_built_sees_the_map_that_is_opened(page: ConnectedPage) -> None:
+    """Before there is a run: such a page drops the view, and would stand among the points."""
+    street = load_scene(bundled_scenes()["street_fisheye"])
+    assert isinstance(street, MapScene)
+    shown = Canvas(
+        page.handle, DisplayControls(page.handle.gui, print), lambda *_: None, lambda _: None, lambda *_: None, 0
+    )
+    places: list[Any] = []
+    page.answer = lambda message: places.append(message) if message["type"] == "SetCameraPositionMessage" else None
+    shown.draw_map("street", street, None)
+    until(lambda: len(places) == 1)
+    page.send(HELLO | {"position": views.START, "look_at": (0.0, 0.0, 0.0), "fov": 0.8})
+    until(lambda: len(places) == 2)
+    assert places[0]["position"] == places[1]["position"]
 
 
 def test_what_is_hidden_is_right_for_where_the_viewer_stands_at_last(

@@ -331,13 +331,15 @@ class Canvas:
         late that the viewer has arrived: walls may have come meanwhile."""
         self._make_room()
         looked, picture = self._looked, self._picture
-        if looked is None or picture is None:
+        if looked is None:
             return
         untouched = self._untouched()
         if views.stands_at(self._client, views.START):  # a page that was still being built has dropped the view
             with self._lock:
                 self._take(*looked[:3])
-        elif looked[0] != HELD and untouched and (self._walls_came or self._is_reshaped(*looked[2:])):
+            return
+        changed = self._walls_came or self._is_reshaped(*looked[2:])
+        if picture is not None and looked[0] != HELD and untouched and changed:
             with self._lock:
                 self._look(looked[0], picture)
 
