@@ -294,6 +294,9 @@ def test_frames_of_a_video_are_its_sharpest(tmp_path, rng, capsys):
     names = []
     assert frames_of(video, tmp_path, 3, names.append) == []
     assert names == ["frame_000002.jpg", "frame_000006.jpg", "frame_000010.jpg"]
+    for count, taken in ((7, 7), (11, 11), (40, 12)):
+        again: list[str] = []
+        assert frames_of(video, tmp_path / f"{count}", count, again.append) == [] and len(again) == taken
     _take_frames(video, 1, tmp_path, lambda *_: None)
     said = "has 2 more images, such as frame_000006.jpg, which are mapped with the frames."
     assert said in capsys.readouterr().err, "one of the three is taken again"
@@ -304,6 +307,13 @@ def test_frames_of_a_video_are_its_sharpest(tmp_path, rng, capsys):
     (tmp_path / "text.mp4").write_text("no video")
     with pytest.raises(InputError, match="cannot read it as a video"):
         frames_of(tmp_path / "text.mp4", tmp_path / "frames", 3, names.append)
+    cv2.imwrite(str(tmp_path / "a.png"), sharp)
+    (tmp_path / "glasses.vrs").write_bytes(b"vrs")
+    for given, what in (("a.png", "is an image; "), ("glasses.vrs", "is a recording of Project Aria's glasses; ")):
+        with pytest.raises(InputError, match=what):
+            frames_of(tmp_path / given, tmp_path / "frames", 3, names.append)
+    with pytest.raises(InputError, match=r"is a folder of \d+ images; "):
+        frames_of(tmp_path, tmp_path / "frames", 3, names.append)
     assert not (tmp_path / "frames").exists()
 
 

@@ -5,12 +5,13 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from math import ceil, log
+from math import log
 from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
 
+from spherloc.datasets.given_path import VIDEOS, known_as
 from spherloc.errors import InputError
 from spherloc.files import is_file, is_image, write_whole
 from spherloc.images import grey, read_reduced
@@ -193,26 +194,28 @@ def _about(
 
 
 def frames_of(video: Path, folder: Path, count: int, advance: Callable[[str], None]) -> list[str]:
-    """Write about ``count`` frames of a video into ``folder``, which is made, and return a remark if it ends early.
+    """Write ``count`` frames of a video, or all if it has no more, into ``folder``, which is made, and return a remark
+    if it ends early.
 
     The video is divided into equal pieces, of which the sharpest frame each is written. ``advance`` is called after
     each frame with its file name. Existing frames are not written again. Raises ``InputError`` if the video cannot be
     read or the folder cannot be written.
     """
+    other = "" if video.suffix.lower() in VIDEOS else known_as(video)
     if not is_file(video):
-        raise InputError(f"{video}: is not a file; give a video.")
+        raise InputError(other or f"{video}: is not a file; give a video.")
     with _without_lines_of_ffmpeg():
         reader = cv2.VideoCapture(str(video))
     total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT)) if reader.isOpened() else 0
     if total <= 0:
-        raise InputError(f"{video}: OpenCV cannot read it as a video; convert it, to MP4 with H.264 for instance.")
+        cannot = f"{video}: OpenCV cannot read it as a video; convert it, to MP4 with H.264 for instance."
+        raise InputError(other or cannot)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); give another folder.") from None
-    stretch = max(1, ceil(total / count))
     written = read = 0
-    for number, frame, end in _sharpest(reader, stretch):
+    for number, frame, end in _sharpest(reader, min(count, total), total):
         name = f"frame_{number:06d}.jpg"
         path = folder / name
         if not is_file(path):
@@ -247,13 +250,15 @@ def _without_lines_of_ffmpeg() -> Iterator[None]:
         os.environ.pop(FFMPEG_LEVEL, None)
 
 
-def _sharpest(reader: cv2.VideoCapture, stretch: int) -> Iterator[tuple[int, ByteArray, int]]:
-    """Number and pixels of the sharpest frame of each ``stretch`` frames, and how many were read until then."""
+def _sharpest(reader: cv2.VideoCapture, pieces: int, total: int) -> Iterator[tuple[int, ByteArray, int]]:
+    """Number and pixels of the sharpest frame of each piece, ``pieces`` of ``total`` frames, and how many were read
+    until then."""
     best: tuple[float, int, ByteArray] | None = None
-    number = 0
+    number = piece = 0
     while True:
         there, frame = reader.read()
-        if best is not None and (not there or number % stretch == 0):
+        before, piece = piece, number * pieces // total
+        if best is not None and (not there or piece != before):
             yield best[1], best[2], number
             best = None
         if not there:
