@@ -201,11 +201,11 @@ def _cell(view: View, picture: str, row: QueryResult | None, unit: str) -> str:
     wrapped = "width:0;min-width:100%;overflow-wrap:anywhere;line-height:1.15"
     words = escape(end_of(view.name, width_px))
     name = f'<div aria-hidden="true" style="{wrapped};text-align:center;{DIM}">{words}</div>'
+    framed = f"position:relative;border:{border};border-radius:4px;overflow:hidden"
     return (
         f'<div role="listitem"><div role="button" tabindex="0" data-touch="strip-open:{escape(view.name)}" '
-        f'title="{escape(said)}" aria-label="{escape(said)}" '
-        f'style="position:relative;border:{border};border-radius:4px;cursor:pointer;overflow:hidden">{image}{mark}'
-        f"</div>{name}</div>"
+        f'title="{escape(said)}" aria-label="{escape(said)}" style="cursor:pointer">'
+        f'<div style="{framed}">{image}{mark}</div>{name}</div></div>'
     )
 
 
