@@ -66,6 +66,18 @@ def row(tab: Playground, kind: str, name: str) -> Locator:
     return pressed.filter(has_text=re.compile(rf"^{re.escape(name)}")).last
 
 
+DROPPED = """name => {
+    const dataTransfer = new DataTransfer(), at = document.querySelector("canvas");
+    dataTransfer.items.add(new File(["text"], name));
+    return ["dragover", "drop"].map((kind) => {
+        const event = new DragEvent(kind, { bubbles: true, cancelable: true, dataTransfer });
+        at.dispatchEvent(event);
+        return event.defaultPrevented;
+    });
+}"""
+"""Drops a file onto the canvas; whether the page has kept each event from the browser."""
+
+
 def test_scenes_are_opened_from_allowed_folders(open_page: Callable[..., Playground], folders: Path) -> None:
     tab = open_page()
     tab.tab("Open")
@@ -89,6 +101,10 @@ def test_scenes_are_opened_from_allowed_folders(open_page: Callable[..., Playgro
     expect(tab.widget("Scene")).to_have_value("northern street")
     expect(tab.entry("Seed")).to_have_value("8")
     tab.tab("Open")
+    assert tab.page.evaluate(DROPPED, "rooms") == [True, True], "the browser does not show the file in the page's place"
+    expect(tab.page.get_by_text("rooms was not opened")).to_be_visible()
+    tab.press("Close")
+    expect(tab.page.get_by_text("rooms was not opened")).to_have_count(0)
     expect(tab.page.get_by_text("Recent", exact=True)).to_be_visible()
     expect(tab.page.get_by_text("hidden.toml")).to_have_count(0)
     assert tab.errors == []
