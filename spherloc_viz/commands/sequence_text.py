@@ -7,7 +7,7 @@ from spherloc.datasets.map_scene import LIKE_REFERENCE, MapScene
 from spherloc.diagnosis.causes import Cause
 from spherloc.errors import shorten
 from spherloc.experiments.configuration import Configuration
-from spherloc.experiments.results import LOCALIZED, PICTURE, POSED, UNREADABLE, QueryResult, SequenceResults
+from spherloc.experiments.results import DOUBTFUL, LOCALIZED, PICTURE, POSED, UNREADABLE, QueryResult, SequenceResults
 from spherloc.experiments.sequence import INITIALISED
 from spherloc.experiments.summary import SuccessRate, Summary, TrajectoryError, success_rates, timed
 from spherloc.frontend.gravity_from_lines import why_not_found
@@ -124,13 +124,20 @@ def _each(results: SequenceResults, scene: MapScene) -> Iterator[str]:
             told = True
             off = f", expected error {turned:.2g} deg and {results.configuration.length(moved)}"
         at = ", ".join(f"{value:.2f}" if abs(value) < FAR else f"{value:.2g}" for value in row.position_m)
-        why = f" ({row.diagnosis})" if row.diagnosis not in (None, str(Cause.OK)) else ""
         agree = f"{row.inliers or 0:,} of {row.matches or 0:,} matches agree"
         near = nearest(scene, row.cam_from_map, images.get(row.query)) if row.cam_from_map is not None else ""
         place = f"at ({at}), {near}" if near else f"at ({at})"
-        yield f"{row.query}: {row.status}{why}, {place}, {agree}{off}"
+        yield f"{row.query}: {row.status}{_why(row)}, {place}, {agree}{off}"
     if told:
         yield "expected errors are what the noise of the matches leaves; errors of the map and of the lens add to them"
+
+
+def _why(row: QueryResult) -> str:
+    """The cause, in brackets, of a pose that is not good; that of a doubtful one can be that the truth bears it out."""
+    if row.diagnosis not in (None, str(Cause.OK)):
+        return f" ({row.diagnosis})"
+    right = row.status == DOUBTFUL and row.diagnosis is not None and row.rotation_error_deg is not None
+    return " (right, as the truth shows)" if right else ""
 
 
 def _trajectory_lines(error: TrajectoryError | None, setting: Configuration) -> Iterator[str]:

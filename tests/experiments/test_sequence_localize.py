@@ -226,8 +226,8 @@ def test_limits_are_not_included_and_both_count(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("drawn")
-def test_success_is_told_of_each_folder_too(tmp_path: Path) -> None:
-    """Folders are cameras, or times of day: their success rates are published apart."""
+def test_success_is_told_of_each_folder_too_and_what_is_doubtful(tmp_path: Path) -> None:
+    """Folders are cameras, or times of day: their success rates are published apart. A doubtful pose can be right."""
     scene = replace(scene_of(tmp_path), thresholds=((1.0, 0.1), (2.0, 0.25)))
 
     def row(index: int, name: str, degrees: float, truth: bool = True) -> QueryResult:
@@ -243,6 +243,12 @@ def test_success_is_told_of_each_folder_too(tmp_path: Path) -> None:
     lines = sequence_text(told, summarize(told), scene).splitlines()
     assert "    day: 50.0 / 100.0 % of 2" in lines and "    night: 0.0 / 100.0 % of 1" in lines
     assert not any(line.startswith("    other") for line in lines)
+    wrong = replace(rows[3], status="doubtful", diagnosis="ambiguous")
+    rows[2:] = [replace(rows[2], status="doubtful", diagnosis="ok"), wrong, replace(wrong, diagnosis="ok")]
+    doubted = results_of(scene, rows)
+    words = [line for line in sequence_text(doubted, summarize(doubted), scene).splitlines() if ": doubtful" in line]
+    shown = [line.split(": ", 1)[1].split(", at")[0] for line in words]
+    assert shown == ["doubtful (right, as the truth shows)", "doubtful (ambiguous)", "doubtful"]
     alone = results_of(scene, rows[:2])
     assert "    day: " not in sequence_text(alone, summarize(alone), scene)
 
