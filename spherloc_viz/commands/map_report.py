@@ -9,6 +9,7 @@ import numpy as np
 
 from spherloc.errors import InputError
 from spherloc.frontend import trained
+from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import View
 from spherloc.geometry import camera_centre
 from spherloc.mapping.advice import advice
@@ -64,8 +65,8 @@ def summary(made: Map, found: Photographs) -> list[str]:
             "gravity must point down, with x right, y down and z forward"
         )
     lines += [f"in doubt      {doubt}" for doubt in made.doubts]
-    if made.carried_deg:
-        lines.append(f"masked        {_carried_words(made.carried_deg)}")
+    if said := _masked_words(made):
+        lines.append(f"masked        {said}")
     if missing:
         lines.append(f"left out      {', '.join(missing[:5])}{', …' if len(missing) > 5 else ''}: see the report")
     for group in made.groups:
@@ -163,6 +164,19 @@ def _corrected_words(made: Map) -> str:
     )
 
 
+def _masked_words(made: Map) -> str:
+    """What was left out of the photographs; empty if nothing was."""
+    masks = made.masks or Masks()
+    said = [] if masks.images is None else [f"what is black in {masks.images.name}"]
+    if made.carried_deg:
+        said.append(_carried_words(made.carried_deg))
+    elif masks.nadir_deg:
+        said.append(f"{masks.nadir_deg:g}° around straight down")
+    if masks.seam_deg:
+        said.append(f"{masks.seam_deg:g}° on both sides of the seam of two lenses")
+    return "; ".join(said)
+
+
 def _carried_words(degrees: float) -> str:
     return (
         f"{degrees:g}° around straight down, where all images show the same: what carries the camera{advice('carried')}"
@@ -199,7 +213,7 @@ def map_report(made: Map, found: Photographs) -> str:
         "Down": _down(made),
         **({"Lens": _corrected_words(made)} if made.corrected_rad else {}),
         "Features": MAP_FEATURES[made.features],
-        **({"Masked": _carried_words(made.carried_deg)} if made.carried_deg else {}),
+        **({"Masked": masked} if (masked := _masked_words(made)) else {}),
         "Scale": scale,
     }
     rows = [_row(made, names, index) for index in range(len(views))]

@@ -195,7 +195,7 @@ def _remarks(rows: Sequence[QueryResult]) -> Iterator[str]:
         known = (NO_POINT, INITIALISED, TRIED) if row.status in POSED else (INITIALISED, TRIED)
         for remark in row.remarks:
             if not why_not_found(remark) and not any(word in remark for word in known):
-                about.setdefault(remark, []).append(row.query)
+                about.setdefault(remark.removeprefix(f"{row.query}: "), []).append(row.query)
     for remark, queries in list(about.items())[:MAX_TOLD]:
         more = f" and {len(queries) - 1} more" if len(queries) > 1 else ""
         yield f"{queries[0]}{more}: {remark.removesuffix('.')}"

@@ -249,6 +249,9 @@ def test_success_is_told_of_each_folder_too_and_what_is_doubtful(tmp_path: Path)
     words = [line for line in sequence_text(doubted, summarize(doubted), scene).splitlines() if ": doubtful" in line]
     shown = [line.split(": ", 1)[1].split(", at")[0] for line in words]
     assert shown == ["doubtful (right, as the truth shows)", "doubtful (ambiguous)", "doubtful"]
+    tagged = [replace(row, remarks=(f"{row.query}: has no tags.",)) for row in rows[:2]]
+    lines = sequence_text(results_of(scene, tagged), summarize(results_of(scene, tagged)), scene).splitlines()
+    assert "  day/0.png and 1 more: has no tags" in lines, "images that have the same are named once"
     alone = results_of(scene, rows[:2])
     assert "    day: " not in sequence_text(alone, summarize(alone), scene)
 
