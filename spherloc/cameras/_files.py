@@ -1,5 +1,6 @@
 """Reads calibration files as tables, lists and numbers, with errors that name the place of a wrong value."""
 
+import errno
 import json
 import re
 from pathlib import Path
@@ -61,6 +62,8 @@ def read_text(path: Path) -> str:
     except IsADirectoryError:
         raise CalibrationError(f"is a folder: give the calibration file itself{_such_as(path)}.") from None
     except OSError as error:
+        if error.errno == errno.EFBIG:
+            raise UnrecognisedError(f"is {reason(error)}, which no calibration is: {KNOWN}.") from None
         raise UnrecognisedError(f"cannot be read ({reason(error)}): check the path and its permissions.") from None
     try:
         return content.decode("utf-8-sig")

@@ -218,7 +218,7 @@ def test_a_number_of_too_many_digits_is_refused_without_printing_it(refused):
 
 def test_binary_and_large_files_are_refused(refused):
     assert "byte 2 is not UTF-8" in refused(b"ab\xff\xfe")
-    assert "larger than 256 KiB" in refused(b"#" * (MAX_FILE_BYTES + 1))
+    assert "is larger than 256 KiB, which no calibration is: give a YAML" in refused(b"#" * (MAX_FILE_BYTES + 1))
 
 
 def test_missing_files_directories_and_impossible_paths(tmp_path):
