@@ -103,8 +103,9 @@ def test_scenes_are_opened_from_allowed_folders(open_page: Callable[..., Playgro
     tab.tab("Open")
     assert tab.page.evaluate(DROPPED, "rooms") == [True, True], "the browser does not show the file in the page's place"
     expect(tab.page.get_by_text("rooms was not opened")).to_be_visible()
-    tab.press("Close")
-    expect(tab.page.get_by_text("rooms was not opened")).to_have_count(0)
+    tab.tab("Play")
+    expect(tab.page.get_by_text("rooms was not opened")).to_have_count(0)  # the card goes with the next press elsewhere
+    tab.tab("Open")
     expect(tab.page.get_by_text("Recent", exact=True)).to_be_visible()
     expect(tab.page.get_by_text("hidden.toml")).to_have_count(0)
     assert tab.errors == []

@@ -25,6 +25,7 @@
     Object.assign(card.style, { left: `${box.left + (box.width - width) / 2}px`, width: `${width}px` });
   }
 
+  addEventListener("pointerdown", ({ target }) => { if (!card?.contains(target)) card?.remove(); }, true);
   for (const kind of ["dragover", "drop"]) {
     addEventListener(kind, (event) => {
       const given = event.dataTransfer;
