@@ -90,7 +90,7 @@ def test_the_strip_is_sorted_turned_and_told(tmp_path):
     assert "page 1 of 3" in html and "strip-page:1" in html and "<q30>" not in html and "&lt;q30&gt;: failed" in html
     assert html.count("strip-open:") == 24 and "9 of 80 matches" in html
     pressed = html.partition("strip-open:&lt;q00&gt;")[2].partition('role="listitem"')[0]
-    assert pressed.endswith('&lt;q00&gt;</div></div></div><div '), "the name below a picture is part of its button"
+    assert pressed.endswith("&lt;q00&gt;</div></div></div><div "), "the name below a picture is part of its button"
     assert thumbnail(queries[0]) == ""
     cv2.imwrite(str(queries[0].path), np.full((320, 320, 3), 90, np.uint8))
     assert thumbnail(queries[0]).startswith("data:image/jpeg;base64,")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from spherloc.errors import InputError, SpherlocError, StoppedError, show
 from spherloc.files import lock
+from spherloc.frontend.masks import Masks
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.advice import advice
 from spherloc.mapping.alignment.line_gravity import GravityByLines
@@ -62,6 +63,8 @@ class Map:
     carried_deg: float = 0.0
     """Half the opening angle of the cone around straight down that was left out, since what is in it moves with the
     camera; 0 if nothing was found."""
+    masks: Masks | None = None
+    """What was left out of the photographs, that cone included."""
     stated: Mapping[str, Gravity] = field(default_factory=dict)
     """Gravity of photographs that a file or their tags state, by name."""
     doubts: tuple[str, ...] = ()
@@ -170,6 +173,7 @@ def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
         lines,
         features=kept.how.features.method,
         carried_deg=built.carried_deg,
+        masks=built.masks,
         stated=known,
         doubts=tuple(doubts),
         lens=request.lens,

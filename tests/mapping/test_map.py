@@ -188,6 +188,16 @@ def test_gravity_that_a_file_states_goes_before_that_of_lines(walk, tmp_path):
         read_stated_gravity(tmp_path / "none.txt", None, found.views)
 
 
+def test_what_was_masked_is_said(walk):
+    _, found, made, *_ = walk
+    assert "masked        12° around straight down" in summary(made, found)
+    without = replace(made, masks=None)
+    assert "masked" not in "".join(summary(without, found)) and "Masked" not in map_report(without, found)
+    masked = replace(made, masks=Masks(Path("masks/car.png"), 25.0, 1.0))
+    said = "what is black in car.png; 25° around straight down; 1° on both sides of the seam of two lenses"
+    assert f"masked        {said}" in summary(masked, found) and said in map_report(masked, found)
+
+
 def test_one_command_localizes_new_photographs(walk, tmp_path, monkeypatch, capsys):
     """Two of the map itself; the same command again finds them done, and a map in metres of its own has its own."""
     _, found, *_, output = walk
