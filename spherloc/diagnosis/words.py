@@ -123,7 +123,7 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
             are = "is" if right == 1 else "are"
             return f"Only {right} of {total} matches {are} right, {_by_chance(e, right, truth.within)}.{lucky}"
         case Cause.TOO_FEW_INLIERS:
-            return f"Only {best} of {total} matches agree with any pose, {_by_chance(e, best)}."
+            return f"No pose was found that more than {best} of {total} matches agree with, {_by_chance(e, best)}."
         case Cause.WRONG_REFERENCE if _contradicts(e, truth):
             return (
                 f"No match is right by the true pose, but {best} of {total} agree with another pose, which chance does "
