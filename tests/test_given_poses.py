@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from recording_samples import scene_problem
 from spherloc import registry
 from spherloc.datasets import bundled_scenes
 from spherloc.datasets.match_table import read_match_table
+from spherloc.diagnosis import Cause, diagnose
 from spherloc.errors import InputError
 from spherloc.estimators import estimate, options_type
 from spherloc.formats.pose_files import read_poses
@@ -134,6 +136,21 @@ def table_files(folder: Path, *rows: str) -> tuple[Path, Path, Path]:
     down = scene_problem(NAME).gravity_camera
     gravity.write_text("\n".join(f"{name} {down[0]} {down[1]} {down[2]} 0" for name in ("a.jpg", "b.jpg")) + "\n")
     return matches, camera, gravity
+
+
+def test_a_better_pose_is_found_although_gravity_has_a_wide_bound() -> None:
+    """That of the given pose has one of 5 degrees, within which wrong matches lead a fit away from nine right ones."""
+    problem = scene_problem("panorama_outliers_90")
+    pose = problem.truth_cam_from_map
+    assert pose is not None
+    problem = replace(
+        problem, pixels=problem.pixels + 0.5, gravity_bound_rad=np.radians(5.0),
+        truth_cam_from_map=None, truth_inliers=None,
+    )  # fmt: skip
+    turned, moved = wxyz_from_rotation(pose[:, :3]), pose[:, 3] + [3.0, 0.0, 1.0]
+    numbers = dict(zip(("qw", "qx", "qy", "qz", "tx", "ty", "tz"), map(float, (*turned, *moved)), strict=True))
+    diagnosis = diagnose(estimate(problem, "given-pose", options_type("given-pose")(**numbers)))
+    assert diagnosis.cause is Cause.SEARCH_MISSED and "one with 9 of 100 matches exists" in diagnosis.summary
 
 
 def test_matches_of_all_queries_come_in_one_table(tmp_path: Path) -> None:

@@ -303,13 +303,18 @@ def gather(trace: Trace) -> Evidence:
 
 
 def _other_fits(trace: Trace, bounds: Bounds) -> list[Fit]:
-    """Poses from a longer search, and those that the run itself found beside its pose."""
+    """Poses from a longer search, and those that the run itself found beside its pose.
+
+    Within a wide gravity bound a fit of few right matches may be led away by wrong ones: a pose with the given gravity,
+    which can be better than its bound, is looked for too.
+    """
     aligned, options = trace.problem.aligned, trace.options
-    found = search(aligned, bounds.noise_px, options)
+    given = [replace(aligned, gravity_bound_rad=0.0)] if aligned.gravity_bound_rad else []
+    found = [search(one, bounds.noise_px, options) for one in [aligned, *given]]
     stage = trace.stage(ConsensusStage)
     verified = [] if stage is None else [aligned.align_pose(pose) for pose in stage.cam_from_map]
     poses = [refine(aligned, pose, bounds, options)[0] for pose in verified]
-    return [fit_of(aligned, pose) for pose in ([] if found is None else [found]) + poses]
+    return [fit_of(aligned, pose) for pose in [*found, *poses] if pose is not None]
 
 
 def different(one: FloatArray, other: FloatArray) -> bool:
