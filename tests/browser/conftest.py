@@ -1,6 +1,7 @@
 """One server and one browser for all tests of the page."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -31,14 +32,39 @@ def address(tmp_path_factory: pytest.TempPathFactory, recordings: Path) -> Itera
         yield found
 
 
+HERE = Path(__file__).parent
+_browsers: list[Browser] = []
+_at_end = ExitStack()
+
+
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    """A headless Chromium with WebGL in software. Not kept for the session: Playwright's event loop blocks others."""
-    path = find_chromium()
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=path, headless=True, args=list(FLAGS))
-        yield chromium
-        chromium.close()
+def browser() -> Browser:
+    """A headless Chromium with WebGL in software, kept for the next file here: a new one costs 5 s."""
+    if not _browsers:
+        path = find_chromium()
+        playwright = _at_end.enter_context(sync_playwright())
+        _browsers.append(playwright.chromium.launch(executable_path=path, headless=True, args=list(FLAGS)))
+        _at_end.callback(_browsers[0].close)
+    return _browsers[0]
+
+
+def _close_browser() -> None:
+    _browsers.clear()
+    _at_end.close()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(nextitem: pytest.Item | None) -> Generator[None, object, object]:
+    """The browser is not kept for tests elsewhere: Playwright's event loop blocks others."""
+    result = yield
+    if nextitem is None or HERE not in nextitem.path.parents:
+        _close_browser()
+    return result
+
+
+def pytest_sessionfinish() -> None:
+    """Also where a run ends early."""
+    _close_browser()
 
 
 @pytest.fixture

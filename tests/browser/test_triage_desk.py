@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playground import BLIND, FLAGS, PATIENCE_MS, SCENE, find_chromium, served
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playground import BLIND, PATIENCE_MS, SCENE, served
+from playwright.sync_api import Browser, Page, expect
 from test_accessibility import RULES
 
 from spherloc.datasets import load_scene
@@ -45,15 +45,6 @@ def home(folder: Path) -> Iterator[str]:
     """A server with these runs."""
     with served(folder / "small.toml", "--recordings", folder) as (address, _):
         yield address
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    """A browser of its own, which no other module's page keeps busy."""
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=find_chromium(), headless=True, args=list(FLAGS))
-        yield chromium
-        chromium.close()
 
 
 class Desk:
