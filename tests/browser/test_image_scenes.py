@@ -1,7 +1,7 @@
 """A scene made of images, as a user meets it: queries, matches on the photographs, the map's mesh, a whole sequence."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -69,11 +69,13 @@ def images_address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[s
         yield found, folder / "recordings"
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def images_tab(browser: Browser, images_address: tuple[str, Path]) -> Iterator[Playground]:
-    tab = Playground(browser, images_address[0])
+    """One page for all tests, which go on where the one before ended: a page and its first run cost 7 s. A link opens
+    it, to a scene that is not there."""
+    tab = Playground(browser, f"{images_address[0]}/#v=1&scene=nowhere")
     yield tab
-    tab.close()
+    tab.page.context.close()
 
 
 READ_PHOTO = """async place => {
@@ -139,14 +141,37 @@ def recorded_queries(folder: Path) -> set[str]:
     return {read_recording(path).problem.name.split(", ")[1] for path in folder.glob("*.rrd")}
 
 
-def test_a_link_to_a_scene_that_is_not_there_opens_the_page_s_own(
-    browser: Browser, images_address: tuple[str, Path]
-) -> None:
-    """Before there is a run, no query is chosen yet."""
-    tab = Playground(browser, f"{images_address[0]}/#v=1&scene=nowhere", new=True)
+def test_a_link_to_a_scene_that_is_not_there_opens_the_page_s_own(images_tab: Playground) -> None:
+    tab = images_tab
     expect(tab.page.get_by_text("The scene 'nowhere' is not open here").first).to_be_visible()
     expect(tab.page).to_have_url(re.compile("scene=small.apartment"))
-    tab.page.context.close()
+
+
+def is_visible(tab: Playground, name: str) -> bool:
+    """Whether a node is on the canvas and seen."""
+    return bool((tab.node(name) or {}).get("visible"))
+
+
+def test_the_query_on_the_sphere_and_the_mesh_around_it(images_tab: Playground) -> None:
+    tab = images_tab
+    for name in ("/sphere/image", "/backdrop"):
+        tab.until(lambda name=name: is_visible(tab, name), f"{name} is there")
+    tab.unfold("Layers")
+    for label, name in (("Image", "/sphere/image"), ("Mesh", "/backdrop")):
+        tab.tick(label, False)
+        tab.until(lambda name=name: not is_visible(tab, name), f"{label} is hidden")
+        tab.tick(label, True)
+        tab.until(lambda name=name: is_visible(tab, name), f"{label} is back")
+    tab.settle()
+    tab.press("From the camera")
+    centre = tab.centre("/cameras/estimate")
+    tab.until(lambda: np.allclose(tab.viewer[:3], centre, atol=0.02), "the viewer stands in the camera")
+    fov = "() => window.__viserMutable.camera.fov"
+    tab.until(lambda: round(tab.page.evaluate(fov)) == 85, "the viewer sees wide")
+    for name, seen in (("From the camera", False), ("Overview", True)):
+        tab.press(name)
+        seen_so = lambda seen=seen: is_visible(tab, "/cameras/estimate") == seen  # noqa: E731
+        tab.until(seen_so, "one does not see the camera from inside")
 
 
 def test_queries_their_photographs_and_the_whole_sequence(
@@ -198,33 +223,17 @@ def test_queries_their_photographs_and_the_whole_sequence(
     tab.expect_quiet(images_address[0])
 
 
-def test_the_query_on_the_sphere_and_the_mesh_around_it(
-    images_tab: Playground, images_address: tuple[str, Path]
-) -> None:
-    """A panorama and, opened from its folder, a fisheye, whose image leaves a hole."""
+def test_a_fisheye_is_opened_from_its_folder(images_tab: Playground, images_address: tuple[str, Path]) -> None:
+    """Its image leaves a hole in the sphere; a query that was localized before is told, with the doubt about it."""
     tab = images_tab
-    visible: Callable[[str], bool] = lambda name: bool((tab.node(name) or {}).get("visible"))  # noqa: E731
-    tab.until(lambda: visible("/sphere/image") and visible("/backdrop"), "the image and the mesh are there")
-    tab.unfold("Layers")
-    for label, name in (("Image", "/sphere/image"), ("Mesh", "/backdrop")):
-        tab.tick(label, False)
-        tab.until(lambda name=name: not visible(name), f"{label} is hidden")
-        tab.tick(label, True)
-        tab.until(lambda name=name: visible(name), f"{label} is back")
-    tab.settle()
-    tab.press("From the camera")
-    centre = tab.centre("/cameras/estimate")
-    tab.until(lambda: np.allclose(tab.viewer[:3], centre, atol=0.02), "the viewer stands in the camera")
-    fov = "() => window.__viserMutable.camera.fov"
-    tab.until(lambda: round(tab.page.evaluate(fov)) == 85, "the viewer sees wide")
-    for name, seen in (("From the camera", False), ("Overview", True)):
-        tab.press(name)
-        tab.until(lambda seen=seen: visible("/cameras/estimate") == seen, "one does not see the camera from inside")
-
+    tab.press("Sphere")
+    tab.until(lambda: is_visible(tab, "/sphere/image"), "the image of the panorama")
     panorama = tab.node("/sphere/image")
     tab.tab("Open")
     tab.touch("open-folder:0:0:").click()
     tab.page.get_by_text("fisheye apartment").click()
+    tab.touch("open-folder:").click()
+    expect(tab.touch("open-folder:0:0:")).to_be_visible()
     expect(tab.value("inliers")).to_be_visible()
     tab.tab("Images")
     tab.until(lambda: photo(tab, "query")[0] == photo(tab, "query")[1], "a square photograph")
@@ -240,7 +249,7 @@ def test_the_query_on_the_sphere_and_the_mesh_around_it(
     tab.touch("strip-open:query_000").click()
     expect(beside).to_have_count(0)
     tab.press("Sphere")  # at the outcome, the view shows where the localized photograph was taken
-    tab.until(lambda: visible("/sphere/image") and tab.node("/sphere/image") != panorama, "another image")
+    tab.until(lambda: is_visible(tab, "/sphere/image") and tab.node("/sphere/image") != panorama, "another image")
     tab.expect_quiet(images_address[0])
 
 
