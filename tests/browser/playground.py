@@ -59,10 +59,12 @@ PATIENCE_MS = 300_000
 START_S = 600.0
 """How long a server may take to say where it is."""
 BLIND = """for (const kind of [WebGLRenderingContext, WebGL2RenderingContext])
-    for (const call of ["drawArrays", "drawElements", "drawArraysInstanced", "drawElementsInstanced"])
-        if (kind.prototype[call]) kind.prototype[call] = () => undefined;"""
-"""Makes the canvas draw nothing. What tests read is in the page and in the scene's nodes, and a frame in software takes
-most of a second, for which every click waits."""
+    for (const call of ["drawArrays", "drawElements", "drawArraysInstanced", "drawElementsInstanced"]) {
+        const draw = kind.prototype[call];
+        if (draw) kind.prototype[call] = function (...all) { if (window.canvasIsDrawn) draw.apply(this, all); };
+    }"""
+"""Makes the canvas draw nothing but while a test wants to see it. What tests read is in the page and in the scene's
+nodes, and a frame in software takes most of a second, for which every click waits."""
 ASIDE = """addEventListener("DOMContentLoaded", () => {
     const look = document.createElement("style");
     look.textContent = "[class*=Notifications-root], [class*=Notifications-root] * {pointer-events: none !important}";
@@ -141,13 +143,10 @@ _spare_pages: WeakKeyDictionary[Browser, list[Page]] = WeakKeyDictionary()
 class Playground:
     """One tab."""
 
-    def __init__(
-        self, browser: Browser, address: str, drawn: bool = False, new: bool = False, sharpness: float = SHARPNESS
-    ) -> None:
-        """Open the page, wait for its first run and go to the run's last step; ``drawn`` has the canvas really drawn,
-        which is slow, and ``new`` is a browser that has never been here: it stays where the page opens, on a screen of
-        that ``sharpness``."""
-        self._spare = None if drawn or new else _spare_pages.setdefault(browser, [])
+    def __init__(self, browser: Browser, address: str, new: bool = False, sharpness: float = SHARPNESS) -> None:
+        """Open the page, wait for its first run and go to the run's last step; ``new`` is a browser that has never been
+        here: it stays where the page opens, on a screen of that ``sharpness``."""
+        self._spare = None if new else _spare_pages.setdefault(browser, [])
         if self._spare:
             self.page = self._spare.pop()
         else:
@@ -159,8 +158,7 @@ class Playground:
             context.add_init_script(ASIDE)
             if not new:
                 context.add_init_script(KNOWN)
-            if not drawn:
-                context.add_init_script(BLIND)
+            context.add_init_script(BLIND)
             self.page = context.new_page()
             self.page.set_default_timeout(PATIENCE_MS)
         self.errors: list[str] = []
@@ -211,6 +209,10 @@ class Playground:
         self.page.context.clear_permissions()
         self.page.mouse.move(0, 0)
         self._spare.append(self.page)
+
+    def draw_canvas(self, on: bool) -> None:
+        """Have the canvas really drawn, which is slow, or no longer."""
+        self.page.evaluate("on => { window.canvasIsDrawn = on; }", on)
 
     def value(self, name: str) -> Locator:
         """The cell of the outcome table beside a name."""

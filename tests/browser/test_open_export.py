@@ -47,12 +47,12 @@ def own_address(folders: Path) -> Iterator[str]:
 
 
 @pytest.fixture
-def open_page(browser: Browser, own_address: str) -> Iterator[Callable[..., Playground]]:
+def open_page(browser: Browser, own_address: str) -> Iterator[Callable[[], Playground]]:
     """Opens pages of this file's own server and closes them after the test."""
     pages: list[Playground] = []
 
-    def opened(drawn: bool = False) -> Playground:
-        pages.append(Playground(browser, own_address, drawn))
+    def opened() -> Playground:
+        pages.append(Playground(browser, own_address))
         return pages[-1]
 
     yield opened
@@ -78,7 +78,7 @@ DROPPED = """name => {
 """Drops a file onto the canvas; whether the page has kept each event from the browser."""
 
 
-def test_scenes_are_opened_from_allowed_folders(open_page: Callable[..., Playground], folders: Path) -> None:
+def test_scenes_are_opened_from_allowed_folders(open_page: Callable[[], Playground], folders: Path) -> None:
     tab = open_page()
     tab.tab("Open")
     row(tab, "scene", "fisheye_outliers_80.toml").click()
@@ -134,7 +134,7 @@ def scratch_files(folders: Path) -> list[Path]:
 
 
 def test_an_upload_is_solved_and_stays_with_its_page(
-    open_page: Callable[..., Playground], own_address: str, folders: Path
+    open_page: Callable[[], Playground], own_address: str, folders: Path
 ) -> None:
     catalog = Catalog(folders / "start" / "small.toml")
     problem = catalog.problem(SceneRequest("small street", 77))
@@ -193,13 +193,14 @@ def downloaded(tab: Playground, button: str, folder: Path) -> Path:
 
 
 def test_what_is_seen_leaves_as_files(
-    browser: Browser, open_page: Callable[..., Playground], folders: Path, tmp_path: Path
+    browser: Browser, open_page: Callable[[], Playground], folders: Path, tmp_path: Path
 ) -> None:
-    tab = open_page(drawn=True)
+    tab = open_page()
     expect(tab.page.get_by_text(re.compile(r"^Recorded as "))).to_be_visible()
     inliers = tab.value("inliers").inner_text()
     tab.tab("Share")
 
+    tab.draw_canvas(True)
     picture = downloaded(tab, "Picture (PNG)", tmp_path)
     assert picture.name == "spherloc-small-street-mc.png"
     pixels = np.asarray(Image.open(picture).convert("RGB"))
@@ -210,6 +211,7 @@ def test_what_is_seen_leaves_as_files(
     assert 20 < len(words) < 0.2 * height and words.std() > 5.0, "scene and step stand below the canvas"
     pixels = pixels[: height - 2]
     seen = np.asarray(Image.open(io.BytesIO(tab.page.screenshot(clip=box))).convert("RGB"))  # pyright: ignore
+    tab.draw_canvas(False)
     assert np.abs(pixels[-4, 4].astype(int) - seen[-4, 4]).max() <= 2, "the background is the page's"
     colors, counts = np.unique(pixels.reshape(-1, 3), axis=0, return_counts=True)
     assert len(colors) > 50 and counts.max() < 0.995 * counts.sum()
