@@ -12,26 +12,19 @@ in exposure, colour, sharpness and noise. Maps are compared with the truth as by
 
 import argparse
 import json
-from itertools import combinations, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
-import pycolmap
 from scipy.spatial.transform import Rotation
 
+from benchmarks.judged_pairs import judged_pairs, print_table
 from benchmarks.maps import cells, uneven
 from spherloc.cameras.kannala_brandt import KannalaBrandt
-from spherloc.frontend.features import extract
-from spherloc.geometry import camera_centre, pose, rotation_angle
-from spherloc.mapping.images.photographs import photographs
-from spherloc.mapping.parallel import as_completed
-from spherloc.mapping.two_view.level_pairs import fitting
-from spherloc.mapping.two_view.pairs import SURE, ImagePairs, relative
+from spherloc.geometry import camera_centre, pose
 from spherloc.types import FloatArray
 from spherloc.worlds import Conditions, build_world, render
-from spherloc_viz.commands.map import how_of
 
 SETS = tuple(f"apartment:{seed}:{lens}" for seed in (31, 32, 33) for lens in ("rgb", "slam"))
 LENSES = {
@@ -41,9 +34,6 @@ LENSES = {
 COUNT = 36
 YAW_SD_DEG, PITCH_DEG, PITCH_SD_DEG, ROLL_SD_DEG, ASIDE_SD_M, UP_SD_M = 45.0, 8.0, 9.0, 4.0, 0.15, 0.03
 """Of the head, which is turned down by the second on average."""
-RIGHT_DEG = 3.0, 10.0
-"""A pair is right if its rotation and the direction to the second camera are off by no more."""
-STEPS = (0.0, SURE / 4.0, SURE / 2.0, SURE, 2.0 * SURE, np.inf)
 
 
 def smooth(rng: np.random.Generator, sd: float, reach: int) -> FloatArray:
@@ -82,33 +72,12 @@ def row(one: str, features: str) -> str:
         return f"| {one} | {cells(folder, {name: camera_centre(one) for name, one in poses.items()}, features)}"
 
 
-def sure_pairs(one: str, features: str) -> list[tuple[float, bool]]:
-    """The matches that fit each pair, times the cube of its peak, and whether its pose is right."""
+def pairs_of(one: str, features: str) -> list[tuple[float, bool]]:
+    """How sure the pairs of a set are, and which are right."""
     world, seed, lens = one.split(":")
-    how, camera = how_of(features), LENSES[lens]
     with TemporaryDirectory() as place:
         folder = Path(place) / "images"
-        poses = list(photographed(world, int(seed), lens, folder).values())
-        views = photographs(folder, {}).views
-        found = dict(as_completed(lambda index: extract(views[index], how.features), range(COUNT)))
-    images = [found[index] for index in range(COUNT)]
-    usable = [np.flatnonzero(camera.unproject(image.pixels)[0][:, 2] > 0.1) for image in images]
-    pairs = ImagePairs(pycolmap, [camera] * COUNT, images, usable, [None] * COUNT, how.matching, frozenset())
-    judged = []
-    for (first, second), (matches, geometry) in as_completed(
-        lambda pair: pairs.compare(*pair), list(combinations(range(COUNT), 2))
-    ):
-        if geometry is None or pairs.same_place(geometry):
-            continue
-        rotation, way = relative(geometry)
-        rays = pairs.bearings[first][matches[:, 0]], pairs.bearings[second][matches[:, 1]]
-        count = np.count_nonzero(fitting(*rays, rotation, way, pairs.bound_rad))
-        true = poses[second][:, :3] @ poses[first][:, :3].T
-        true_way = poses[second][:, 3] - true @ poses[first][:, 3]
-        aside = np.degrees(np.arccos(np.clip(way @ true_way / np.linalg.norm(true_way), -1.0, 1.0)))
-        right = np.degrees(rotation_angle(rotation @ true.T)) <= RIGHT_DEG[0] and aside <= RIGHT_DEG[1]
-        judged.append((count * pairs.peak(first, second, (rotation, way)) ** 3, bool(right)))
-    return judged
+        return judged_pairs(folder, list(photographed(world, int(seed), lens, folder).values()), features)
 
 
 def main() -> None:
@@ -119,11 +88,7 @@ def main() -> None:
     words.add_argument("--pairs", action="store_true")
     given = words.parse_args()
     if given.pairs:
-        found = [pair for one in given.sets for pair in sure_pairs(one, given.features)]
-        print("| matches times the cube of the peak | right pairs | wrong pairs |\n|---|---|---|")
-        for low, high in pairwise(STEPS):
-            some = [right for value, right in found if low <= value < high]
-            print(f"| {low:g} to {high:g} | {sum(some)} | {len(some) - sum(some)} |")
+        print_table([pair for one in given.sets for pair in pairs_of(one, given.features)])
         return
     print("| fisheyes | maps of | right | wrong | median of the right ones, cm |\n|---|---|---|---|---|")
     for one in given.sets:

@@ -2,16 +2,20 @@
 
     .venv/bin/python -m benchmarks.maps [apartment:12 campus:20:7:uneven ...]
     .venv/bin/python -m benchmarks.maps --features sift+aliked           # with the extra ``learned``
+    .venv/bin/python -m benchmarks.maps --pairs                          # right and wrong pairs by how sure they are
 
 A world, a number of panoramas, evenly along its path, and the world's seed (0 if none is given) are one row; with
 ``uneven`` behind it exposure, colour, sharpness and noise differ, as in photographs that one takes in passing, with
-``plain`` textures have a third of their contrast, as in rooms with plain walls. Each of
+``plain`` textures have a third of their contrast, as in rooms with plain walls. With ``unlike`` photographs are
+uneven, and no two parts of floors, wallpaper and bookcases look the same, as they do in the worlds: a floor of tiles of
+two metres puts images of one room into another. Each of
 the maps that ``spherloc map`` makes of them is put onto the truth by the similarity that most of its images agree with;
 an image that is then more than ``WRONG_M`` off is wrong. Maps of two images are not judged. Needs the extra ``colmap``.
 """
 
 import argparse
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,6 +23,7 @@ from tempfile import TemporaryDirectory
 import cv2
 import numpy as np
 
+from benchmarks.judged_pairs import judged_pairs, print_table
 from spherloc.datasets.scene_file import load_scene
 from spherloc.errors import InputError
 from spherloc.experiments.summary import align
@@ -27,6 +32,7 @@ from spherloc.mapping.images.photographs import photographs
 from spherloc.mapping.make import make_map
 from spherloc.mapping.request import MapRequest
 from spherloc.types import ByteArray, FloatArray
+from spherloc.worlds.world import Surfaces, World
 from spherloc_viz.commands.map import how_of
 
 SETS = (
@@ -38,6 +44,9 @@ SETS = (
     "campus:20",
 )
 WRONG_M = 0.25
+REPEATED, SHOWN = ("parquet", "stone_floor", "ceiling", "paper", "books"), 0.6
+"""Beginnings of the names of textures that are seen many times, and the share of the sides of one that a piece shows
+in an ``unlike`` world."""
 FEW = 3
 """Images that fix a similarity."""
 SCENE = """
@@ -78,22 +87,52 @@ def plain(image: ByteArray, rng: np.random.Generator) -> ByteArray:
     return np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), np.uint8)
 
 
-CHANGES: Mapping[str, Callable[[ByteArray, np.random.Generator], ByteArray]] = {"uneven": uneven, "plain": plain}
+CHANGES: Mapping[str, Callable[[ByteArray, np.random.Generator], ByteArray]] = {
+    "uneven": uneven,
+    "plain": plain,
+    "unlike": uneven,
+}
 """What makes photographs of rendered images."""
 
 
+def unlike(world: World) -> World:
+    """A world in which each piece of a floor, of wallpaper and of a row of books shows another part of its texture,
+    mirrored or not."""
+
+    def build() -> Surfaces:
+        made, rng = world.build(), np.random.default_rng([world.seed, 3])
+        mesh, boxes, uv = made.mesh, made.atlas.boxes, made.mesh.uv.copy()
+        for surface in np.unique(mesh.surface):
+            faces = np.flatnonzero(mesh.surface == surface)
+            if not made.atlas.names[mesh.tile[faces[0]]].startswith(REPEATED):
+                continue
+            low, size = np.split(boxes[mesh.tile[faces[0]]].astype(float), 2)
+            corners, shown, mirrored = (
+                np.unique(mesh.faces[faces]),
+                rng.uniform(0.0, 1.0 - SHOWN, 2),
+                rng.random(2) < 0.5,
+            )
+            within = (uv[corners] - low) / size
+            uv[corners] = low + size * (shown + SHOWN * np.where(mirrored, 1.0 - within, within))
+        return replace(made, mesh=replace(mesh, uv=uv))
+
+    return replace(world, kind=f"{world.kind} unlike", build=build)
+
+
 def photographed(world: str, count: int, seed: int, change: str, folder: Path) -> dict[str, FloatArray]:
-    """Write the panoramas into a folder; returns their true positions (3,), metres, by name."""
+    """Write the panoramas into a folder; returns their true poses (3, 4), metres, by name."""
     rng = np.random.default_rng(seed)
     path = folder.with_suffix(".toml")
     path.write_text(SCENE.format(world=world, count=count, seed=seed))
     folder.mkdir()
-    places = {}
-    for view in load_scene(path).references:
-        name = f"{view.name}.png"
-        cv2.imwrite(str(folder / name), CHANGES[change](view.read(), rng) if change else view.read())
-        places[name] = camera_centre(view.cam_from_map)
-    return places
+    pictures = [view.picture for view in load_scene(path).references]
+    place = unlike(pictures[0].world) if change == "unlike" else pictures[0].world
+    poses = {}
+    for picture in pictures:
+        name, image = f"{picture.name}.png", replace(picture, world=place).image()
+        cv2.imwrite(str(folder / name), CHANGES[change](image, rng) if change else image)
+        poses[name] = picture.cam_from_map
+    return poses
 
 
 def errors_m(poses: dict[str, FloatArray], places: dict[str, FloatArray]) -> FloatArray:
@@ -131,25 +170,43 @@ def cells(folder: Path, places: dict[str, FloatArray], features: str) -> str:
     return f"{sizes} | {len(right)} | {wrong} | {median} |"
 
 
-def row(world: str, count: int, seed: int, change: str, features: str) -> str:
+def row(one: str, features: str) -> str:
     """One line of the table."""
+    world, count, seed, change = parts_of(one)
     title = f"{world}, {count}" + (f", seed {seed}" if seed else "") + (f", {change}" if change else "")
     with TemporaryDirectory() as place:
         folder = Path(place) / "panoramas"
-        return f"| {title} | {cells(folder, photographed(world, count, seed, change, folder), features)}"
+        poses = photographed(world, count, seed, change, folder)
+        return f"| {title} | {cells(folder, {name: camera_centre(one) for name, one in poses.items()}, features)}"
+
+
+def pairs_of(one: str, features: str) -> list[tuple[float, bool]]:
+    """How sure the pairs of a set are, and which are right."""
+    with TemporaryDirectory() as place:
+        folder = Path(place) / "panoramas"
+        poses = photographed(*parts_of(one), folder)
+        return judged_pairs(folder, [poses[name] for name in sorted(poses)], features)
+
+
+def parts_of(one: str) -> tuple[str, int, int, str]:
+    """World, number of panoramas, seed and change of a set."""
+    world, count, *more = one.split(":")
+    return world, int(count), int(more[0]) if more else 0, more[1] if len(more) > 1 else ""
 
 
 def main() -> None:
     """Print the table."""
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("sets", nargs="*", default=SETS, metavar="WORLD:COUNT[:SEED[:uneven|plain]]")
+    words.add_argument("sets", nargs="*", default=SETS, metavar="WORLD:COUNT[:SEED[:CHANGE]]")
     words.add_argument("--features", default="sift")
+    words.add_argument("--pairs", action="store_true")
     given = words.parse_args()
+    if given.pairs:
+        print_table([pair for one in given.sets for pair in pairs_of(one, given.features)])
+        return
     print("| panoramas | maps of | right | wrong | median of the right ones, cm |\n|---|---|---|---|---|")
     for one in given.sets:
-        world, count, *more = one.split(":")
-        seed = int(more[0]) if more else 0
-        print(row(world, int(count), seed, more[1] if len(more) > 1 else "", given.features), flush=True)
+        print(row(one, given.features), flush=True)
 
 
 if __name__ == "__main__":

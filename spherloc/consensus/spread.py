@@ -6,7 +6,6 @@ there are many matches in the rest of it of which hardly any agrees. Other image
 may look at it with a small part of their view.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,15 +89,4 @@ def spread_of(camera: Camera, bearings: FloatArray, agreeing: BoolArray) -> Spre
         agreeing_inside=int((inside & agreeing).sum()),
         rest=int((~inside).sum()),
         agreeing_rest=int((~inside & agreeing).sum()),
-    )
-
-
-def joined(spreads: Sequence[Spread]) -> Spread:
-    """The counts of several views added, with their mean radius."""
-    return Spread(
-        radius_deg=float(np.mean([spread.radius_deg for spread in spreads])),
-        inside=sum(spread.inside for spread in spreads),
-        agreeing_inside=sum(spread.agreeing_inside for spread in spreads),
-        rest=sum(spread.rest for spread in spreads),
-        agreeing_rest=sum(spread.agreeing_rest for spread in spreads),
     )

@@ -12,7 +12,6 @@ from spherloc.consensus.spread import MAX_RADIUS_DEG, MIN_REST, spread_of
 from spherloc.diagnosis.causes import Cause
 from spherloc.diagnosis.decide import diagnose
 from spherloc.estimators.base import estimate
-from spherloc.mapping.two_view.pairs import fit_on_one_thing
 from spherloc.outcome import Outcome, judge
 
 PANORAMA = Equirectangular(400, 200)
@@ -81,17 +80,3 @@ def test_a_pose_on_one_thing_in_the_view_is_doubtful(scene_of):
     found = diagnose(trace)
     assert found.cause is Cause.FALSE_CONSENSUS and found.alternative_cam_from_map is None
     assert "something that looks alike may stand there" in found.summary and "add images of the place" in found.advice
-
-
-@pytest.mark.parametrize(("shelf", "elsewhere", "left_out"), [(30, 3, True), (30, 20, False), (80, 3, False)])
-def test_panoramas_that_fit_on_one_thing(rng, shelf, elsewhere, left_out):
-    """Few matches that fit, and hardly any outside a part of both views."""
-    fits = np.zeros(shelf + 120, bool)
-    fits[: shelf + elsewhere] = True
-    rays = tuple(
-        np.concatenate([around(rng, middle, 15.0, shelf), around(rng, np.negative(middle), 90.0, 120)])
-        for middle in ([0.2, 0.1, 1.0], [1.0, -0.2, 0.1])
-    )
-    assert fit_on_one_thing((PANORAMA, PANORAMA), rays, fits) is left_out
-    fisheye = KannalaBrandt(400, 400, 90, 90, 200, 200, (0.0,) * 4)
-    assert not fit_on_one_thing((PANORAMA, fisheye), rays, fits)

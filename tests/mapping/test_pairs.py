@@ -165,18 +165,31 @@ def test_a_pose_is_sure_if_no_other_direction_has_nearly_as_many_matches(rng, ca
     assert bool(pair.sureness(0, 1, matches, geometry) < SURE) is unsure
 
 
-@pytest.mark.parametrize("by_sift", [True, False])
-def test_matches_of_sift_alone_may_show_that_it_is_no_thing_that_stands_at_two_places(rng, tmp_path, by_sift):
-    """LightGlue finds more matches on such a thing, so that of its own far more must fit."""
-    right, count, second = 80, 200, pose(yaw_rotation(0.3), [0.5, 0.0, 0.2])
-    shelf = rng.uniform([-1.5, -1.0, 3.0], [1.5, 1.0, 5.0], (right, 3))
-    here = np.concatenate([shelf, around(rng, count - right, -60.0, 60.0)])
-    there = np.concatenate([transform(second, shelf), around(rng, count - right, -60.0, 60.0)])
-    lightglue = MatchOptions("lightglue", weights=tmp_path / "none.onnx")
-    pair = two_images(rng, here, there, 2, lightglue, {(0, 1)})
-    geometry = pair._estimated(0, 1, np.tile(np.arange(right, dtype=np.uint32)[:, None], 2))
-    matches = np.tile(np.arange(0 if by_sift else right, 2 * count, dtype=np.uint32)[:, None], 2)
-    assert bool(pair.sureness(0, 1, matches, geometry) < SURE) is not by_sift
+@pytest.mark.parametrize(
+    ("right", "widest_deg", "alike", "sure"),
+    [
+        (60, 35.0, 0, True),
+        (60, 35.0, 300, False),
+        (60, 110.0, 300, True),
+        (30, 110.0, 2400, False),
+        (180, 110.0, 2400, True),
+    ],
+)
+def test_panoramas_that_fit_in_a_part_of_the_view_need_a_higher_peak(rng, right, widest_deg, alike, sure):
+    """A floor has many features like each other, which match whatever the direction is, and fills a part of the view;
+    where matches fit all around, the same peak is enough, and many of them are enough in any case."""
+    second = pose(yaw_rotation(0.3), [0.5, 0.0, 0.2])
+    up = np.arccos(rng.uniform(np.cos(np.radians(widest_deg)), 1.0, right + alike))
+    turn = rng.uniform(-np.pi, np.pi, right + alike)
+    things = np.column_stack([np.sin(up) * np.cos(turn), np.sin(up) * np.sin(turn), np.cos(up)])
+    things *= rng.uniform(1.0, 4.0, (right + alike, 1))
+    there = transform(second, np.concatenate([things[:right], rng.permutation(things[right:])]))
+    words = rng.normal(size=(right + alike, 128)).astype(np.float32)
+    words[right:] = rng.normal(size=128) + 0.2 * rng.normal(size=(alike, 128))
+    pair = two_images(rng, things, there, words=words)
+    matches = np.tile(np.arange(right, dtype=np.uint32)[:, None], 2)
+    geometry = pair._estimated(0, 1, matches)
+    assert bool(pair.sureness(0, 1, matches, geometry) >= SURE) is sure
 
 
 def test_lightglue_matches_promising_pairs_only(rng, tmp_path):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from spherloc.cameras.base import Camera
 from spherloc.cameras.equirectangular import Equirectangular
-from spherloc.consensus.spread import joined, spread_of
+from spherloc.consensus.spread import spread_of
 from spherloc.frontend.feature_kinds import Descriptors
 from spherloc.frontend.features import Features
 from spherloc.frontend.matching import FeatureMatches, MatchOptions, match
@@ -43,14 +43,14 @@ PEAK = 1.7
 """Least peak (``ImagePairs.peak``) of a direction found through a third image, and of that between two panoramas."""
 LEAN_RAD = float(np.radians(1.5))
 """Angle by which the gravities of two images may differ under their relative pose, besides the bounds on gravity."""
-MANY_FIT, MIN_RATIO = 55, 1.0 / 3.0
-"""Two panoramas with fewer matches that fit than the first number, and a ``Spread.ratio`` below the second, may show
-one thing that stands at two places: so it is with all pairs whose pose is wrong in a rendered flat of rooms alike, and
-with few of the others."""
-MANY_FIT_LEARNED = 250
-"""The first of them where LightGlue matches, too, which finds many more on things that look alike."""
-MANY_FIT_PEAK = 140
-"""Two panoramas with fewer matches that fit, and a peak below ``PEAK``, may show two places that look alike."""
+WIDE_DEG = 280.0
+"""The pose of two panoramas is sure if the cube of its peak times the radius of the part of the views in which the
+matches lie that fit (``Spread.radius_deg``, mean of the two) is that much: a peak of 1.5 where they lie all around, 1.8
+where they are within 50 degrees of one direction, as those of a floor or of a shelf that stands at two places.
+``benchmarks.maps`` counts right and wrong pairs by that number."""
+MANY_AROUND, AROUND_DEG = 120, 75.0
+"""It is sure, too, if so many matches fit within a part of at least that radius: on paving, which fits many directions,
+the peak is low."""
 SURE = 200.0
 """Of other images, which share a part of their view only, a pose is sure if so many matches fit it, times the cube of
 its peak: 60 matches with a peak of 1.5, or 25 with one of 2. ``benchmarks.fisheyes`` shows pairs by that number."""
@@ -110,10 +110,6 @@ class ImagePairs:
         self._pixels = [sphere.project(rays)[0] for rays in self.bearings]
         self._words = [_unit(one.descriptors[index]) for one, index in zip(features, usable, strict=True)]
         self._gravity = gravity
-        self._of_first_kind = [
-            index < (len(one.parts[0]) if one.parts else 0) for one, index in zip(features, usable, strict=True)
-        ]
-        """(K,) which of them are of the first of joined kinds."""
         self._number_of = [np.full(len(found), -1) for found in features]
         for numbers, index in zip(self._number_of, usable, strict=True):
             numbers[index] = np.arange(len(index))
@@ -196,25 +192,23 @@ class ImagePairs:
     def sureness(self, first: int, second: int, pairs: NDArray[np.uint32], geometry: Any) -> float:
         """How sure a pose is; it should be ``SURE``.
 
-        Infinity if a calibration tells it. Of panoramas 0 or infinity: whether what fits of the matches (M, 2) may be a
-        thing that stands at two places, or a place that looks alike; of joined kinds of features the first alone may
-        show that it is none. Of others the number of those that fit, times the
-        cube of the peak, or times what makes ``MANY_SURE`` sure.
+        Infinity if a calibration tells it. Of panoramas the cube of the peak times the radius of the part of the view
+        in which the matches (M, 2) lie that fit, over ``WIDE_DEG``, times ``SURE``, and ``SURE`` at least if
+        ``MANY_AROUND`` fit. Of others the number of those that fit, times the cube of the peak, or times what makes
+        ``MANY_SURE`` sure.
         """
         if self.is_as_fixed((first, second), geometry):
             return np.inf
         rays, pose = self._rays(first, second, pairs), relative(geometry)
         fits = fitting(*rays, *pose, self.bound_rad)
-        count, cameras = np.count_nonzero(fits), (self._cameras[first], self._cameras[second])
+        count, cameras = int(np.count_nonzero(fits)), (self._cameras[first], self._cameras[second])
+        peak = self.peak(first, second, pose) ** 3
         if all(isinstance(camera, Equirectangular) for camera in cameras):
-            clear = count >= MANY_FIT_PEAK or self.peak(first, second, pose) >= PEAK
-            learned = self._learned(first, second)
-            one_thing = fit_on_one_thing(cameras, rays, fits, MANY_FIT_LEARNED if learned else MANY_FIT)
-            if one_thing and learned:
-                own = fits & self._of_first_kind[first][pairs[:, 0]] & self._of_first_kind[second][pairs[:, 1]]
-                one_thing = np.count_nonzero(own) < MIN_MATCHES or fit_on_one_thing(cameras, rays, own, MANY_FIT)
-            return 0.0 if one_thing or not clear else np.inf
-        return count * max(self.peak(first, second, pose) ** 3, SURE / MANY_SURE)
+            spreads = [spread_of(camera, seen, fits) for camera, seen in zip(cameras, rays, strict=True)]
+            radius_deg = float(np.mean([0.0 if spread is None else spread.radius_deg for spread in spreads]))
+            many = float(count >= MANY_AROUND and radius_deg >= AROUND_DEG)
+            return SURE * max(peak * radius_deg / WIDE_DEG, many)
+        return count * max(peak, SURE / MANY_SURE)
 
     def peak(self, first: int, second: int, pose: Relative) -> float:
         """How many times as many guided matches fit a pose as one with another direction to the second camera."""
@@ -343,17 +337,6 @@ class ImagePairs:
     def same_place(self, geometry: Any) -> bool:
         """Whether the two images were taken from one place."""
         return geometry.config != self._pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-
-
-def fit_on_one_thing(
-    cameras: tuple[Camera, Camera], rays: tuple[FloatArray, FloatArray], fits: BoolArray, many: int = MANY_FIT
-) -> bool:
-    """Whether two panoramas show one thing that may stand at two places: fewer than ``many`` of their matches, with
-    bearings (M, 3) in each, fit a pose, and hardly any outside a part of the view. False for other cameras."""
-    spreads = [spread_of(camera, seen, fits) for camera, seen in zip(cameras, rays, strict=True)]
-    known = [spread for spread in spreads if spread is not None]
-    few = np.count_nonzero(fits) < many
-    return bool(few and len(known) == len(spreads) and joined(known).ratio < MIN_RATIO)
 
 
 def _unit(descriptors: Descriptors) -> NDArray[np.float32]:
