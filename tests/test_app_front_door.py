@@ -24,6 +24,7 @@ from spherloc_viz.app.web import viser_internals
 from spherloc_viz.app.web.access import Access, Role, is_own_name, open_socket, refusal
 from spherloc_viz.app.web.desk import DeskRoom
 from spherloc_viz.app.web.downloads import Downloads
+from spherloc_viz.app.web.drops import DropRoom
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.page import load_page
 from spherloc_viz.app.web.viewer import ViewerRoom
@@ -135,11 +136,11 @@ async def door_to(
     token: bool = False,
     downloads: Downloads | None = None,
     desk: DeskRoom | None = None,
+    drops: DropRoom | None = None,
 ) -> AsyncIterator[Door]:
     listener, access = open_socket("127.0.0.1", 0), Access(token)
-    runner = await FrontDoor("127.0.0.1", port, KEY, access, downloads or Downloads(), viewer, False, desk).start(
-        listener
-    )
+    door = FrontDoor("127.0.0.1", port, KEY, access, downloads or Downloads(), viewer, False, desk, drops=drops)
+    runner = await door.start(listener)
     try:
         async with aiohttp.ClientSession(cookie_jar=aiohttp.DummyCookieJar()) as client:
             yield Door(listener.getsockname()[1], client, access)
@@ -313,6 +314,7 @@ ROUTES = (
     ("GET", "viewer/data/a.review.rrd"),
     ("GET", "nothing"),
     ("POST", ""),
+    ("POST", "drop/x/begin?name=a&count=1&bytes=1"),
     ("PUT", "viewer/data/a.rrd"),
 )
 """One of each kind that the door knows, and some that it does not."""

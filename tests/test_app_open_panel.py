@@ -17,6 +17,7 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.mapping.scenes.scene_files import UNITS_UNKNOWN, MapHead, own_queries, scene_text
 from spherloc_viz.app.panels.open_panel import OpenedScene, OpenPanel, RecentScenes
 from spherloc_viz.app.panels.uploads import MAX_BYTES
+from spherloc_viz.app.web.drops import DropRoom
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from tests.connected_page import ConnectedPage
@@ -42,7 +43,7 @@ EVIL = "<img src=x onerror='alert(1)'>.toml"
 class Visitor:
     """A connected page with the panel on it."""
 
-    def __init__(self, server: viser.ViserServer, folder: Path, recent: Path) -> None:
+    def __init__(self, server: viser.ViserServer, folder: Path, recent: Path, drops: DropRoom | None = None) -> None:
         self.page = ConnectedPage(server, KEY)
         self.opened: list[OpenedScene] = []
         self.touches = Touches(self._failed)
@@ -55,6 +56,7 @@ class Visitor:
             self.opened.append,
             lambda: self.opened[-1].path if self.opened else folder / "a.toml",
             RecentScenes(recent),
+            drops=drops or DropRoom(),
         )
         buttons = [widget for widget in client.gui._gui_input_handle_from_uuid.values()]
         self.matches, self.calibration = (b for b in buttons if isinstance(b, viser.GuiUploadButtonHandle))
@@ -157,6 +159,51 @@ def test_what_cannot_be_opened_is_said_and_nothing_more(visitor: Visitor, words:
     visitor.touch(words)
     assert sentence in visitor.said and not visitor.opened
     assert "open-scene:1:mei_outliers_80.toml" in visitor.rows, "the list is still there"
+
+
+def drop(visitor: Visitor, name: str, count: int) -> None:
+    files = visitor.panel._dropped
+    files.begin(name, count, count)
+    for number in range(count):
+        file = files.open(f"{number}.png")
+        file.write(b"1")
+        file.close()
+    files.end()
+    visitor.settle()
+
+
+def test_photographs_that_are_dropped_are_shown_and_kept(
+    server: viser.ViserServer, folder: Path, tmp_path: Path
+) -> None:
+    visitor = Visitor(server, folder, tmp_path / "recent.json", DropRoom(folder))
+    drop(visitor, "rooms", 3)
+    assert "map-folder:0:dropped_rooms" in visitor.rows and 'data-reveal="dropped-1"' in visitor.panel._list.content
+    assert "Make a map of these 3 photographs<" in visitor.panel._list.content
+    assert f"kept in {folder / 'dropped_rooms'}." in html.unescape(visitor.said)
+    visitor.touch("open-folder:0:0:")
+    assert "data-reveal" not in visitor.panel._list.content
+    visitor.close()
+    assert len(list((folder / "dropped_rooms").iterdir())) == 3
+
+
+def test_photographs_without_a_folder_for_them_go_with_their_page(
+    visitor: Visitor, server: viser.ViserServer, folder: Path, tmp_path: Path
+) -> None:
+    drop(visitor, "", 2)
+    place = "2:dropped_photographs"
+    assert f"map-folder:{place}" in visitor.rows and "go when this page is closed" in visitor.said
+    kept = visitor.panel._roots.find(place)
+    drop(visitor, "", 2)
+    assert f"map-folder:{place}_2" in visitor.rows
+    visitor.touch("open-folder:")
+    assert "open-folder:0:2:" in visitor.rows and "dropped on this page/" in visitor.panel._list.content
+    other = Visitor(server, folder, tmp_path / "recent.json")
+    assert "dropped on this page" not in other.panel._list.content
+    other.touch(f"open-folder:0:{place}")
+    assert "not allowed any more" in other.said
+    other.close()
+    visitor.panel.close()
+    assert not kept.parent.parent.exists()
 
 
 def test_folders_of_cameras_are_offered_as_one_map_unless_a_link_leads_out(visitor: Visitor, folder: Path) -> None:

@@ -31,6 +31,7 @@ from spherloc_viz.app.stage import views
 from spherloc_viz.app.status import Status
 from spherloc_viz.app.web.access import Access, Role, open_socket
 from spherloc_viz.app.web.desk import DeskRoom
+from spherloc_viz.app.web.drops import DropRoom
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.viewer import ViewerRoom, of_index
 from spherloc_viz.app.web.viser_internals import role_header, set_theme, start_viser, stop_viser
@@ -73,7 +74,8 @@ def serve(
     they wait until all is ready; ``framed`` lets other pages of this machine, such as a notebook's, show the page in a
     frame. Runs that a page settles on are recorded into ``recordings`` unless ``record`` is false; beyond
     ``keep_gigabytes`` (2, or what is there if that is more) the oldest successes are deleted. Pages may open scenes
-    from the folder of ``scene`` if it is a scene file, from that of the bundled ones and from ``allow``. A token is
+    from the folder of ``scene`` if it is a scene file, from that of the bundled ones and from ``allow``; photographs
+    that are dropped onto them are kept in the first folder of ``allow`` or else in that of ``scene``. A token is
     demanded if ``token`` says so, and always where the address is not this machine's alone.
     Raises ``InputError`` if the scene, one of these folders or the size cannot be used or the port cannot
     be had, and ``RecordingError`` for a recording that cannot be opened.
@@ -90,6 +92,7 @@ def serve(
         stack.callback(compilation.close)
         compilation.start()
         services = Services(catalog, allowed_roots(scene, allow), first=first, compilation=compilation)
+        services.drops = DropRoom(kept_folder(scene, allow))
         services.begin = None if scene is None else best_localized(catalog, recordings)
         sessions = Sessions(services)
         stack.callback(services.downloads.close)
@@ -109,7 +112,9 @@ def serve(
         stack.callback(sessions.close)
         sessions.attend(server)
         access = Access(demanded=token or not _is_loopback(listener))
-        door = FrontDoor(host, server.get_port(), key, access, services.downloads, viewer, framed, desk)
+        door = FrontDoor(
+            host, server.get_port(), key, access, services.downloads, viewer, framed, desk, drops=services.drops
+        )
         asyncio.run(_serve_until_told(door, access, listener))
 
 
@@ -186,6 +191,15 @@ def allowed_roots(scene: Path | None, allow: Sequence[Path]) -> tuple[Path, ...]
     bundled = {path.parent for path in bundled_scenes().values()}
     own = () if scene is None or is_recording(scene) else (scene.parent,)
     return (*allow, *own, *sorted(bundled))
+
+
+def kept_folder(scene: Path | None, allow: Sequence[Path]) -> Path | None:
+    """The folder in which photographs that are dropped onto a page are kept: the first that is allowed, or that of the
+    scene, beside which scenes of photographs in its map are written; None if they go with their page."""
+    if allow:
+        return Path(allow[0])
+    bundled = {path.resolve() for path in bundled_scenes().values()}
+    return None if scene is None or is_recording(scene) or scene.resolve() in bundled else scene.parent
 
 
 class Sessions:

@@ -12,6 +12,7 @@ from spherloc_viz.app.compilation import Compilation
 from spherloc_viz.app.page_runs import Known
 from spherloc_viz.app.review.run_library import RunLibrary
 from spherloc_viz.app.web.downloads import Downloads
+from spherloc_viz.app.web.drops import DropRoom
 from spherloc_viz.recording.storage.recorder import Recorder
 
 
@@ -95,6 +96,8 @@ class Services:
     """The recordings that pages review; None if there is no folder of them."""
     downloads: Downloads = field(default_factory=Downloads)
     """Files that pages may fetch."""
+    drops: DropRoom = field(default_factory=DropRoom)
+    """The pages onto which photographs can be dropped."""
     presented: Presented = field(default_factory=Presented)
     """What pages of an audience show."""
     first: Known | None = None

@@ -107,7 +107,7 @@ class Session:
         self._listen()
         self._built = True
         # Only now may the page report presses: all handlers are registered.
-        client.gui.add_html(READY)
+        client.gui.add_html(READY + self._controls.dropping)
         self._display.panels.ready()
         # And only then may it see where its address is kept.
         page = self._controls, self._display, self._edits

@@ -67,7 +67,8 @@ def play(
         recordings: Folder of the recordings.
         keep_gigabytes: Size limit of the recordings, GB (2, or their present size if larger). Above it the oldest
             successes without a label or note are deleted.
-        allow: Another folder that pages may open scenes from; give it once for each.
+        allow: Another folder that pages may open scenes from; give it once for each. Photographs that are dropped onto
+            a page are kept in the first.
         token: Demand a token on this machine too, where others have accounts on it.
     """
     from spherloc.datasets import scene_path

@@ -1,5 +1,6 @@
 """Scenes from elsewhere and uploads come onto the page, and what is seen leaves it as files."""
 
+import base64
 import io
 import re
 import time
@@ -66,16 +67,18 @@ def row(tab: Playground, kind: str, name: str) -> Locator:
     return pressed.filter(has_text=re.compile(rf"^{re.escape(name)}")).last
 
 
-DROPPED = """name => {
+DROPPED = """files => {
     const dataTransfer = new DataTransfer(), at = document.querySelector("canvas");
-    dataTransfer.items.add(new File(["text"], name));
+    for (const [name, content] of Object.entries(files))
+        dataTransfer.items.add(new File([Uint8Array.from(atob(content), (letter) => letter.charCodeAt(0))], name));
     return ["dragover", "drop"].map((kind) => {
         const event = new DragEvent(kind, { bubbles: true, cancelable: true, dataTransfer });
         at.dispatchEvent(event);
         return event.defaultPrevented;
     });
 }"""
-"""Drops a file onto the canvas; whether the page has kept each event from the browser."""
+"""Drops files, by name their content in base64, onto the canvas; whether the page has kept each event from the
+browser."""
 
 
 def test_scenes_are_opened_from_allowed_folders(open_page: Callable[[], Playground], folders: Path) -> None:
@@ -101,13 +104,54 @@ def test_scenes_are_opened_from_allowed_folders(open_page: Callable[[], Playgrou
     expect(tab.widget("Scene")).to_have_value("northern street")
     expect(tab.entry("Seed")).to_have_value("8")
     tab.tab("Open")
-    assert tab.page.evaluate(DROPPED, "rooms") == [True, True], "the browser does not show the file in the page's place"
-    expect(tab.page.get_by_text("rooms was not opened")).to_be_visible()
-    tab.tab("Play")
-    expect(tab.page.get_by_text("rooms was not opened")).to_have_count(0)  # the card goes with the next press elsewhere
-    tab.tab("Open")
     expect(tab.page.get_by_text("Recent", exact=True)).to_be_visible()
     expect(tab.page.get_by_text("hidden.toml")).to_have_count(0)
+    assert tab.errors == []
+
+
+def base64_of(picture: np.ndarray) -> str:
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "PNG")
+    return base64.b64encode(file.getvalue()).decode()
+
+
+def test_photographs_that_are_dropped_are_offered_as_a_map(
+    open_page: Callable[..., Playground], folders: Path, rng: np.random.Generator
+) -> None:
+    tab, text = open_page(), base64.b64encode(b"text").decode()
+    card = tab.page.locator(".opening")
+    assert tab.page.evaluate(DROPPED, {"notes": text}) == [True, True], (
+        "the browser does not show it in the page's place"
+    )
+    expect(card).to_contain_text("notes was not opened")
+    expect(card).to_contain_text("Left out: 1 file of another format (notes). Drop photographs (.bmp")
+    tab.tab("Compare")
+    expect(card).to_have_count(0)  # the card goes with the next press elsewhere
+
+    pictures = {f"{name}.png": rng.integers(0, 256, (32, 64, 3), dtype=np.uint8) for name in ("a", "b", "c ü")}
+    photographs = {name: base64_of(picture) for name, picture in pictures.items()}
+    files = photographs | {"camera.toml": base64.b64encode(CAMERA.encode()).decode(), "IMG.HEIC": text}
+    tab.page.evaluate(DROPPED, files)
+    expect(tab.page.get_by_text("Make a map of these 3 photographs")).to_be_in_viewport()  # the tab Open is to be seen
+    expect(card).to_contain_text("3 photographs")
+    expect(card).to_contain_text("Left out: 1 file to be converted to JPEG or PNG (IMG.HEIC).")
+    kept = folders / "maps" / "dropped_photographs"
+    expect(tab.page.get_by_text(f"The photographs are kept in {kept}.")).to_be_visible()
+    assert sorted(path.name for path in kept.iterdir()) == sorted([*photographs, "camera.toml"])
+    for name, picture in pictures.items():
+        np.testing.assert_array_equal(np.asarray(Image.open(kept / name)), picture)
+
+    # While the first file is kept waiting, another drop is not taken, and all of it can be taken back.
+    tab.page.route("**/drop/*/file*", lambda route: None)
+    tab.page.evaluate(DROPPED, photographs)
+    expect(card).to_contain_text("0 of 3 photographs")
+    tab.page.evaluate(DROPPED, {"other.png": photographs["a.png"]})
+    expect(card).to_contain_text("other.png was not opened: drop it when these are there.")
+    assert list((folders / "maps").glob(".dropped*"))
+    card.get_by_role("button", name="Cancel").click()
+    expect(card).to_have_count(0)
+    until(lambda: not list((folders / "maps").glob(".dropped*")))
+    assert not (folders / "maps" / "dropped_photographs_2").exists()
     assert tab.errors == []
 
 

@@ -200,7 +200,9 @@ class Controls:
             self._sweep = SweepPanel(gui, touches, self._chosen_sweep, services.recorder)
         with self._tab(gui, tabs, "Open"):
             gui.add_html(heading_html("Other scenes, your own photographs, and your own matches", "scene"))
-            self._open = OpenPanel(gui, client, touches, services.roots, self._open_scene, self._scene_file)
+            self._open = OpenPanel(
+                gui, client, touches, services.roots, self._open_scene, self._scene_file, drops=services.drops
+            )
         with self._tab(gui, tabs, "Recordings"):
             gui.add_html(heading_html("Recorded runs, and a gallery of failures", "recording"))
             page = RecordingsPage(services.roots, self._enter, owner.open, owner.open_recorded, services.downloads)
@@ -245,6 +247,11 @@ class Controls:
     def camera_movable(self) -> bool:
         """Whether the true camera can be dragged."""
         return self._movable.value and self._movable.visible
+
+    @property
+    def dropping(self) -> str:
+        """HTML that lets photographs be dropped onto the page."""
+        return self._open.dropping
 
     def close(self) -> None:
         """End what runs; does not wait."""

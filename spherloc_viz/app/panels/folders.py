@@ -69,6 +69,10 @@ class Roots:
         resolved = (Path(os.path.realpath(folder)) for folder in folders)
         self.folders = tuple(dict.fromkeys(folder for folder in resolved if folder.is_dir()))
 
+    def add(self, folder: Path) -> None:
+        """Allow another folder, which exists."""
+        self.folders = tuple(dict.fromkeys((*self.folders, Path(os.path.realpath(folder)))))
+
     def find(self, place: str) -> Path:
         """The resolved path of a place "NUMBER:RELATIVE".
 

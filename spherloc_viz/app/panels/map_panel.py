@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,6 +25,7 @@ SCALE_HINT = (
     "For a map in metres: the height of the cameras above the ground, such as 1.6, or two photographs and their "
     "distance, such as 1.jpg 5.jpg 12.5. A map that is there already is only scaled."
 )
+MAX_ENDING_S = 5.0
 MAX_REPORT_BYTES = 500_000_000
 
 
@@ -82,6 +84,14 @@ class MapPanel:
             self._stopped = True
             if self._process is not None:
                 self._process.terminate()
+
+    def wait(self) -> None:
+        """Wait until the process has ended that was stopped, some seconds at most."""
+        with self._lock:
+            process = self._process
+        if process is not None:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(MAX_ENDING_S)
 
     def _follow(self, process: "subprocess.Popen[str]", folder: Path, scratch: "TemporaryDirectory[str]") -> None:
         said: dict[str, Any] = {}

@@ -17,10 +17,12 @@ from spherloc.mapping.advice import for_a_page
 from spherloc.mapping.images.photographs import MIN_IMAGES
 from spherloc.mapping.scenes.new_queries import add_new_images, map_images, map_size
 from spherloc.mapping.scenes.scene_files import MAP_FOLDER, SCENE
+from spherloc_viz.app.panels.dropped import DroppedFiles, dropping_html
 from spherloc_viz.app.panels.folders import Listing, Roots, Row, and_words, describe
 from spherloc_viz.app.panels.map_panel import MapPanel
 from spherloc_viz.app.panels.uploads import MAX_BYTES, MAX_CALIBRATION_BYTES, File, Scratch, UploadForm, open_upload
 from spherloc_viz.app.text import DIM, begun, box, status_html
+from spherloc_viz.app.web.drops import DropRoom
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.web.viser_internals import limit_uploads, update_widget
 from spherloc_viz.app.workers import BackgroundWorker
@@ -54,15 +56,16 @@ def list_html(
     remark: str,
     in_map: str = "",
     made: bool = False,
+    reveal: str = "",
 ) -> str:
     """A folder's content, or the folders that may be looked into; then recent and bundled scenes. ``in_map`` is what
     the map is called in which the folder's photographs can be localized; empty for none. ``made`` says whether there is
-    a map of them."""
+    a map of them. To what can be done with them the page scrolls once for each ``reveal``, unless it is empty."""
     if listing is None:
         folders = [_row_html(f"open-folder:0:{k}:", f"{root.name}/", str(root)) for k, root in enumerate(roots)]
         parts = [_section("Folders", folders)]
     else:
-        parts = [_folder_html(listing, in_map, made)]
+        parts = [_folder_html(listing, in_map, made, reveal)]
     parts += [_section(title, [_scene_html(row) for row in rows]) for title, rows in _titled(recent, bundled)]
     return box("".join(parts), "font-size:12.5px") + (status_html(remark) if remark else "")
 
@@ -71,7 +74,7 @@ def _titled(recent: Sequence[Row], bundled: Sequence[Row]) -> list[tuple[str, Se
     return [(title, rows) for title, rows in (("Recent", recent), ("Bundled", bundled)) if rows]
 
 
-def _folder_html(listing: Listing, in_map: str, made: bool) -> str:
+def _folder_html(listing: Listing, in_map: str, made: bool, reveal: str) -> str:
     """Folder by folder; first the way up, last the other pages."""
     above = "open-folder:" if listing.parent is None else f"open-folder:0:{listing.parent}"
     rows = [_row_html(above, "↑ up" if listing.parent else "↑ all folders", "")]
@@ -79,11 +82,11 @@ def _folder_html(listing: Listing, in_map: str, made: bool) -> str:
         these, about = ("this photograph", ONE_ABOUT) if count == 1 else (f"these {count:,} photographs", NEW_ABOUT)
         if listing.sequence:
             these = "other images of this sequence" if in_map == ITS_MAP else "images of this sequence"
-        rows.append(_row_html(f"localize-folder:{listing.place}", f"Localize {these} in {in_map}", about))
+        rows.append(_row_html(f"localize-folder:{listing.place}", f"Localize {these} in {in_map}", about, reveal))
     if title := _map_title(listing):
         new_about = SEQUENCE_ABOUT if listing.sequence else MAP_ABOUT
         title, about = (f"{title} again", AGAIN_ABOUT) if made else (title, new_about)
-        rows.append(_row_html(f"map-folder:{listing.place}", title, about))
+        rows.append(_row_html(f"map-folder:{listing.place}", title, about, reveal))
     for row in listing.rows:
         if row.kind == "folder":
             rows.append(_row_html(f"open-folder:0:{row.place}", f"{row.name}/", row.about))
@@ -134,13 +137,14 @@ def _scene_html(row: Row) -> str:
     return _row_html(f"open-scene:{row.place}" if row.kind == "scene" else None, row.name, row.about)
 
 
-def _row_html(action: str | None, name: str, about: str) -> str:
-    """A row that is pressed; paler if there is nothing to press."""
+def _row_html(action: str | None, name: str, about: str, reveal: str = "") -> str:
+    """A row that is pressed; paler if there is nothing to press. The page scrolls to one with a new ``reveal``."""
     touch = "" if action is None else f' role="button" tabindex="0" data-touch="{escape(action)}"'
     words = f'<div style="font-size:12px;{DIM};overflow-wrap:anywhere">{escape(about)}</div>' if about else ""
     pale = f"{DIM};" if action is None else ""
     cell = f'<td style="{RULE};{pale}padding:.25em .4em;overflow-wrap:anywhere">{escape(name)}{words}</td>'
-    return f"<tr{touch}>{cell}</tr>"
+    shown = f' data-reveal="{reveal}"' if reveal else ""
+    return f"<tr{touch}{shown}>{cell}</tr>"
 
 
 MAX_RECENT = 8
@@ -179,6 +183,11 @@ class RecentScenes:
 
 
 UPLOADED = "uploaded: "
+DROPPED_HERE = "dropped on this page"
+GOES = (
+    "The photographs, and a map of them, go when this page is closed. spherloc play --allow FOLDER keeps in FOLDER "
+    "what is dropped."
+)
 PASTED = "the pasted calibration"
 
 
@@ -205,15 +214,24 @@ class OpenPanel:
         open_scene: Callable[[OpenedScene], None],
         at_hand: Callable[[], Path],
         recent: RecentScenes | None = None,
+        *,
+        drops: DropRoom,
     ) -> None:
         """``roots`` are the folders that may be looked into; ``open_scene`` is called on a thread of this panel, and
-        ``at_hand`` gives the file of the scene that the page shows."""
+        ``at_hand`` gives the file of the scene that the page shows. What is dropped onto the page comes through
+        ``drops``."""
         self._open_scene, self._at_hand = open_scene, at_hand
         self._roots, self._recent = Roots(roots), recent or RecentScenes()
         self._scratch = Scratch()
+        self._drops, self._dropped = drops, DroppedFiles(self._homes, self._show_dropped)
+        self._drop_address = drops.take_for(self._dropped)
         self._background = BackgroundWorker(f"spherloc-open-{client.client_id}", self._complain)
         self._lock = threading.Lock()
         self._at: tuple[str, int] | None = None
+        self._drop_number = 0
+        self._new: Path | None = None
+        """The folder that was dropped last, to which the page scrolls."""
+        self._scratch_folder: Path | None = None
         self._files: dict[str, File] = {}
         self._bundled: list[Row] = []
         self._status = gui.add_html("", visible=False)
@@ -229,11 +247,45 @@ class OpenPanel:
         touches.on("localize-folder", lambda touch: self._background.ask(lambda: self._localize(touch.argument)))
         self._background.ask(self._refresh)
 
+    @property
+    def dropping(self) -> str:
+        """HTML that lets photographs be dropped onto the page. It is none of the tab's, which may be hidden."""
+        return dropping_html(self._drop_address)
+
     def close(self) -> None:
-        """Forget what was uploaded; does not wait for what is being opened."""
+        """Forget what was uploaded, and what was dropped if it is not kept; does not wait for what is being opened."""
+        self._drops.leave(self._drop_address)
         self._map.close()
         self._background.close()
+        self._dropped.close()
+        self._map.wait()  # it may write into the folder of this page
         self._scratch.close()
+
+    def _homes(self) -> tuple[Callable[[], Path], ...]:
+        """What find the folders for photographs that are dropped, the best first."""
+        kept = self._drops.kept_in
+        return (self._scratch_home,) if kept is None else (lambda: kept, self._scratch_home)
+
+    def _scratch_home(self) -> Path:
+        """The folder of this page for what is dropped, into which it may look."""
+        with self._lock:
+            if self._scratch_folder is None:
+                self._scratch_folder = self._scratch.new() / DROPPED_HERE
+                self._scratch_folder.mkdir()
+                self._roots.add(self._scratch_folder)
+            return self._scratch_folder
+
+    def _show_dropped(self, folder: Path) -> None:
+        """Show a folder that was dropped."""
+        real = folder.resolve()
+        place = self._roots.place(real)
+        assert place is not None, "the folders for them are allowed"
+        with self._lock:
+            self._at, self._new = (place, 0), real
+            self._drop_number += 1
+        self._background.ask(self._refresh)
+        gone = self._scratch.has(real)
+        self._say(GOES if gone else f"The photographs are kept in {folder}.")
 
     def _build_form(self, gui: viser.GuiApi) -> None:
         about = (
@@ -334,7 +386,8 @@ class OpenPanel:
         self._say(f"Opening {path.name} …")
         scene = load_scene(path)
         self._open_scene(OpenedScene(scene.name, path, scene))
-        self._recent.note(path)
+        if not self._scratch.has(path):
+            self._recent.note(path)
         self._say("")
         self._refresh()
 
@@ -367,8 +420,10 @@ class OpenPanel:
             self._bundled = [row for _, row in self._described(bundled_scenes().values())]
         in_map = "" if listing is None else self._map_for(listing)
         made = listing is not None and is_file(self._map_of(listing.folder) / SCENE)
+        new = listing is not None and listing.folder == self._new
         last = [replace(row, name=f"{path.parent.name}/{row.name}") for path, row in self._described(recent)]
-        return list_html(listing, self._roots.folders, last, self._bundled, remark, in_map, made)
+        reveal = f"dropped-{self._drop_number}" if new else ""
+        return list_html(listing, self._roots.folders, last, self._bundled, remark, in_map, made, reveal)
 
     def _described(self, paths: Iterable[Path]) -> list[tuple[Path, Row]]:
         """Those of the files that are there and allowed."""

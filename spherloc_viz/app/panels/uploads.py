@@ -84,6 +84,10 @@ class Scratch:
                 raise InputError(f"there is no place for the file ({error.strerror}); make room.") from None
             return folder
 
+    def has(self, path: Path) -> bool:
+        """Whether a path is in it."""
+        return self._folder is not None and path.resolve().is_relative_to(self._folder.resolve())
+
     def close(self) -> None:
         """Remove it with all that is in it."""
         with self._lock:

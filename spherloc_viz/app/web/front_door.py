@@ -11,6 +11,7 @@ from aiohttp import web
 from spherloc_viz.app.web.access import NO_TOKEN, SAFE, Access, Role, refusal, refused
 from spherloc_viz.app.web.desk import DO, MAX_BYTES, NO_RUNS, DeskRoom, is_desk
 from spherloc_viz.app.web.downloads import DOWNLOADS, Downloads
+from spherloc_viz.app.web.drops import DROPS, DropRoom
 from spherloc_viz.app.web.learn import is_learning, learn_answer
 from spherloc_viz.app.web.page import Page, load_page
 from spherloc_viz.app.web.viewer import NOT_RECORDED, PAGE, ViewerRoom
@@ -36,11 +37,15 @@ LINKED = "linked"
 LESSONS_NOT_FOR_AUDIENCE = (
     "Lessons are the presenter's to open: the link for an audience shows what the presenter shows."
 )
+DROPS_NOT_FOR_AUDIENCE = (
+    "Photographs are the presenter's to drop: the link for an audience shows what the presenter shows."
+)
 NOT_FOR_AUDIENCE = "Recordings are the presenter's to open: the link for an audience shows what the presenter shows."
 
 
 class FrontDoor:
-    """Serves one page, one websocket, the lessons, the viewer of recordings and exported files, and nothing else."""
+    """Serves one page, one websocket, the lessons, the viewer of recordings and exported files, takes photographs that
+    are dropped onto pages, and nothing else."""
 
     def __init__(
         self,
@@ -52,12 +57,14 @@ class FrontDoor:
         viewer: ViewerRoom | None = None,
         framed: bool = False,
         desk: DeskRoom | None = None,
+        *,
+        drops: DropRoom | None = None,
     ) -> None:
-        """``viewer`` and ``desk`` are None where nothing is recorded; ``framed`` lets other pages of this machine, such
-        as a notebook's, show the page in a frame."""
+        """``viewer`` and ``desk`` are None where nothing is recorded, ``drops`` where pages take no files; ``framed``
+        lets other pages of this machine, such as a notebook's, show the page in a frame."""
         self._host, self._access = host, access
         self._viewer, self._desk = viewer, desk
-        self._downloads = downloads
+        self._downloads, self._drops = downloads, drops or DropRoom()
         self._upstream = f"http://127.0.0.1:{viser_port}/"
         self._key = key
         self._page: Page = load_page(framed)
@@ -90,7 +97,8 @@ class FrontDoor:
 
     async def _answer(self, request: web.Request) -> web.StreamResponse:
         upgrade = request.headers.get("Upgrade", "").lower() == "websocket"
-        posted = request.method == "POST" and request.path == DO
+        dropped = request.path.startswith(DROPS)
+        posted = request.method == "POST" and (request.path == DO or dropped)
         # A form on another site could post without an Origin of ours; a GET changes nothing.
         reason = refusal(request.headers, self._host, upgrade or posted)
         if reason is not None:
@@ -103,6 +111,12 @@ class FrontDoor:
             return refused(request, NO_TOKEN)
         if request.method not in ("GET", "HEAD") and not posted:
             return web.Response(status=405, text="Only GET is served.\n", headers={"Allow": "GET, HEAD"})
+        if posted and dropped:
+            return (
+                await self._drops.answer(request)
+                if role is Role.PRESENTER
+                else refused(request, DROPS_NOT_FOR_AUDIENCE)
+            )
         if request.path.startswith(PAGE):
             if role is not Role.PRESENTER:
                 return refused(request, NOT_FOR_AUDIENCE)

@@ -34,9 +34,9 @@ SCRIPTS = (
 )
 """What numbers the changes of widgets (``app/web/changes.py``), keeps presses beneath which the page moves, reports
 presses (``app/web/touch.py``), shows the glossary, the introduction, the captions of the projector view and of phones,
-how far the opening of a scene is and how dropped files are opened, puts a note of viser's and the hints of controls
-aside, moves the viewer smoothly, keeps the address (``app/link.py``), mends what is typed into number boxes, names for
-screen readers what viser does not, and says what the entries of a list are there for."""
+how far the opening of a scene is, sends photographs that are dropped (``app/web/drops.py``), puts a note of viser's and
+the hints of controls aside, moves the viewer smoothly, keeps the address (``app/link.py``), mends what is typed into
+number boxes, names for screen readers what viser does not, and says what the entries of a list are there for."""
 
 
 THIS_MACHINE = "http://localhost:* http://127.0.0.1:* https://localhost:* https://127.0.0.1:*"

@@ -185,11 +185,12 @@
 
   addEventListener("pointercancel", end, true);
 
-  // What our other scripts on the page have to tell.
+  // What our other scripts on the page have to tell, and the tab that they open.
   addEventListener("spherloc-touch", ({ detail }) => {
     const nowhere = { left: 0, top: 0, width: 1, height: 1 };
     tell(detail, nowhere, { clientX: 0, clientY: 0 }, { x: 0, y: 0 });
   });
+  addEventListener("spherloc-tab", ({ detail }) => openTab(detail));
   setInterval(() => { look(); followStep(); followLink(); showStep(); reveal(); fetchFiles(); }, LOOK_EVERY_MS);
 
   addEventListener("keydown", (event) => {
