@@ -109,6 +109,18 @@ def test_scenes_are_opened_from_allowed_folders(open_page: Callable[[], Playgrou
     assert tab.errors == []
 
 
+def drop_folder(tab: Playground, folder: Path) -> None:
+    """Drop a folder onto the canvas as a person does, which no script in a page can."""
+    chromium = tab.page.context.new_cdp_session(tab.page)
+    at = tab.page.locator("canvas").first.bounding_box()
+    assert at is not None
+    place = {"x": at["x"] + at["width"] / 2, "y": at["y"] + at["height"] / 2}
+    data = {"items": [], "files": [str(folder)], "dragOperationsMask": 1}
+    for kind in ("dragEnter", "dragOver", "drop"):
+        chromium.send("Input.dispatchDragEvent", {"type": kind, "data": data, **place})
+    chromium.detach()
+
+
 def base64_of(picture: np.ndarray) -> str:
     file = io.BytesIO()
     Image.fromarray(picture).save(file, "PNG")
@@ -116,7 +128,7 @@ def base64_of(picture: np.ndarray) -> str:
 
 
 def test_photographs_that_are_dropped_are_offered_as_a_map(
-    open_page: Callable[..., Playground], folders: Path, rng: np.random.Generator
+    open_page: Callable[..., Playground], folders: Path, tmp_path: Path, rng: np.random.Generator
 ) -> None:
     tab, text = open_page(), base64.b64encode(b"text").decode()
     card = tab.page.locator(".opening")
@@ -140,6 +152,16 @@ def test_photographs_that_are_dropped_are_offered_as_a_map(
     assert sorted(path.name for path in kept.iterdir()) == sorted([*photographs, "camera.toml"])
     for name, picture in pictures.items():
         np.testing.assert_array_equal(np.asarray(Image.open(kept / name)), picture)
+
+    for name in ("left/0.png", "left/1.png", "left/.hidden.png", "right/0.png", "left/deeper/calibration.yaml"):
+        (tmp_path / "my rig" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "my rig" / name).write_bytes(name.encode())
+    drop_folder(tab, tmp_path / "my rig")
+    expect(tab.page.get_by_text("Make a map of the 3 photographs in the folders left and right")).to_be_in_viewport()
+    expect(card).to_contain_text("my rig: 3 photographs")
+    kept = folders / "maps" / "dropped_my_rig"
+    found = {path.relative_to(kept).as_posix(): path.read_text() for path in kept.rglob("*.*")}
+    assert found == {name: name for name in ("left/0.png", "left/1.png", "left/deeper/calibration.yaml", "right/0.png")}
 
     # While the first file is kept waiting, another drop is not taken, and all of it can be taken back.
     tab.page.route("**/drop/*/file*", lambda route: None)

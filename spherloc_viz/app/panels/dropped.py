@@ -60,13 +60,13 @@ class DroppedFiles:
         self._arriving: _ArrivingFile | None = None
 
     def begin(self, name: str, count: int, size_bytes: int) -> None:
-        """Make room for so many files of that size in all, dropped as a folder of that name (empty for none)."""
+        """Make room for so many files of that size in all, dropped as a folder of that name (empty for none). What is
+        still on its way is given up."""
         with self._lock:
             if self._closed:
                 raise InputError("this page has been closed; open another.")
-            if self._folder is not None:
-                raise InputError("other photographs are on their way; wait for them, or cancel them.")
-            if not (0 < count <= MAX_FILES and 0 < size_bytes <= MAX_ALL_BYTES):
+            self._remove()
+            if not (0 < count <= MAX_FILES and 0 <= size_bytes <= MAX_ALL_BYTES):
                 raise InputError(
                     f"{count:,} files of {size_bytes / 1e9:.1f} GB cannot be dropped at once; drop {MAX_FILES:,} files "
                     f"of {MAX_ALL_BYTES / 1e9:.0f} GB at most, or open their folder under Open."

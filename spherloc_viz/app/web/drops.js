@@ -3,6 +3,8 @@
 (() => {
   const MARGIN_PX = 24, WIDEST_EM = 30, MOST_ENTRIES = 20000, MOST_NAMED = 3;
   const LOST = "the playground has not answered; see whether it still runs, and drop them again.";
+  const LOOK_EVERY_MS = 500;
+  let told = "";  // what Python has told: its panel may be folded when something is dropped
   let card = null;
   let sending = null;  // what ends the drop that is going on
   let progress = () => {};  // shows how far that is
@@ -38,7 +40,8 @@
 
   const counted = (count, what) => `${count.toLocaleString("en")} ${what}${count === 1 ? "" : "s"}`;
   const megabytes = (bytes) => (bytes < 1e6 ? "less than 1 MB" : `${Math.round(bytes / 1e6).toLocaleString("en")} MB`);
-  const sentence = (words) => words.slice(0, 1).toUpperCase() + words.slice(1);
+  // The same as a sentence; names of files stay as they are.
+  const sentence = (words) => (/^[a-z]+ /.test(words) ? words.slice(0, 1).toUpperCase() + words.slice(1) : words);
 
   // All files in a dropped entry (FileSystemEntry), as [path, File]; `left` is how many are looked at, at most. What cannot
   // be read is left out.
@@ -66,7 +69,7 @@
     return ["", files];
   }
 
-  // What is sent, as [path, File], how many photographs are among it, and a sentence on what is not.
+  // What is sent, as [path, File, whether it is a photograph], how many of these there are, and what is left out.
   function sorted(files, takes) {
     const sent = [], unread = [], others = [], large = [], more = [];
     let photographs = 0;
@@ -78,7 +81,7 @@
       else if (file.size > (isPhotograph ? takes.mostBytes : takes.mostBytesBeside)) large.push(file.name);
       else if (sent.length === takes.mostFiles) more.push(file.name);
       else {
-        sent.push([path, file]);
+        sent.push([path, file, isPhotograph]);
         photographs += isPhotograph;
       }
     }
@@ -114,31 +117,38 @@
   async function send(title, name, { sent, photographs, left }, { address }) {
     const whole = sent.reduce((sum, [, file]) => sum + file.size, 0), refused = [];
     const all = counted(sent.length, photographs === sent.length ? "photograph" : "file");
-    let done = 0, bytes = 0;
-    progress = () => tell(`${done} of ${all}, ${megabytes(bytes)} of ${megabytes(whole)}. ${another}`, bytes / whole);
+    let done = 0, bytes = 0, kept = 0;
+    progress = () => tell(`${done} of ${all}, ${megabytes(bytes)} of ${megabytes(whole)}. ${another}`, bytes / (whole || 1));
     progress();
-    await post(`${address}begin`, { name, count: sent.length, bytes: whole }, null, sending.signal);
     try {
-      for (const [path, file] of sent) {
+      await post(`${address}begin`, { name, count: sent.length, bytes: whole }, null, sending.signal);
+      for (const [path, file, isPhotograph] of sent) {
         const words = await post(`${address}file`, { name: path }, file, sending.signal);
         if (words) refused.push(words);
+        else kept += isPhotograph;
         done += 1;
         bytes += file.size;
         progress();
       }
+      if (kept === 0) throw new Refused(refused[0]);
       await post(`${address}end`, {}, null, sending.signal);
     } catch (error) {
       await post(`${address}cancel`, {}, null).catch(() => {});
       throw error;
     }
     dispatchEvent(new CustomEvent("spherloc-tab", { detail: "Open" }));
-    const words = [aboutLeft(left), refused.length ? `Not taken: ${sentence(refused[0])}` : ""].filter(Boolean).join(" ");
-    show(`${name ? `${name}: ` : ""}${counted(photographs, "photograph")}`, words || "The tab Open says what can be done with them.");
+    const about = [aboutLeft(left), refused.length ? `Not taken: ${refused[0]}` : ""];
+    const words = [...about, "The tab Open says what can be done with them."].filter(Boolean).join(" ");
+    show(`${name ? `${name}: ` : ""}${counted(kept, "photograph")}`, words);
+  }
+
+  function look() {
+    told = document.querySelector("[data-drops]")?.dataset.drops ?? told;
   }
 
   async function take(dropped, title) {
-    const found = document.querySelector("[data-drops]")?.dataset.drops;
-    if (!found) {
+    look();
+    if (!told) {
       const built = document.querySelector("[data-ready]") !== null;
       show(`${title} was not opened`, built ? "This page is one to look at: it takes no files." : "The page is still being built; drop it again when it is.");
       return;
@@ -150,7 +160,7 @@
     }
     sending = new AbortController();
     [progress, another] = [() => {}, ""];
-    const takes = JSON.parse(found), { signal } = sending;
+    const takes = JSON.parse(told), { signal } = sending;
     show(title, "Looking for photographs …", () => sending.abort());
     try {
       const [name, files] = await filesOf(dropped), what = sorted(files, takes);
@@ -168,6 +178,7 @@
     }
   }
 
+  setInterval(look, LOOK_EVERY_MS);
   addEventListener("pointerdown", ({ target }) => { if (!sending && !card?.contains(target)) card?.remove(); }, true);
   for (const kind of ["dragover", "drop"]) {
     addEventListener(kind, (event) => {

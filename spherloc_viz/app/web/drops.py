@@ -45,6 +45,7 @@ class Receiver(Protocol):
 
     def open(self, name: str) -> Arriving:
         """A file that arrives."""
+        ...
 
     def end(self) -> None:
         """All are there."""
@@ -114,8 +115,8 @@ async def _receive(page: Receiver, name: str, request: web.Request) -> None:
 
 
 def _whole(digits: str) -> int:
-    """A number that a page has told; 0, which is refused, if it is none."""
-    return int(digits) if digits.isascii() and digits.isdecimal() and len(digits) < 16 else 0
+    """A number that a page has told; -1, which is refused, if it is none."""
+    return int(digits) if digits.isascii() and digits.isdecimal() and len(digits) < 16 else -1
 
 
 def _said(status: int, sentence: str) -> web.Response:
