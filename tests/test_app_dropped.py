@@ -250,6 +250,11 @@ def test_files_come_through_the_door_of_their_page_alone(drop: Drop, home: Path)
             assert (drop.kept[0] / "sub" / "a.jpg").read_bytes() == content
             assert (await said(f"{at}end"))[0] == 409
             assert await said(begin) == (200, "") and await said(f"{at}cancel") == (200, "")
+            assert await said(begin) == (200, "")
+            status, sentence = await said(
+                f"{at}file?name=a.jpg", b"none", own | {"Content-Encoding": "gzip", "Connection": "close"}
+            )
+            assert status == 409 and sentence.startswith("a file broke off") and len(list(home.iterdir())) == 1
             room.leave(address)
             assert (await said(begin))[0] == 404
 

@@ -103,13 +103,19 @@ class DropRoom:
 
 
 async def _receive(page: Receiver, name: str, request: web.Request) -> None:
-    """Take the body of a request as a file; nothing is kept of what was dropped if it ends early."""
+    """Take the body of a request as a file.
+
+    Raises ``InputError`` if it is not taken or not whole; nothing is kept then of what was dropped, unless it is a
+    ``NotTakenError``.
+    """
     file = await asyncio.to_thread(page.open, name)
     whole = False
     try:
         async for piece in request.content.iter_chunked(PIECE_BYTES):
             await asyncio.to_thread(file.write, piece)
         whole = True
+    except (web.RequestPayloadError, ConnectionError):
+        raise InputError("a file broke off on its way, so none was kept; drop the photographs again.") from None
     finally:
         await asyncio.to_thread(file.close if whole else page.cancel)
 
