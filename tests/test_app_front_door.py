@@ -213,6 +213,18 @@ def test_everything_else_is_refused() -> None:
     through_an_echo(visit)
 
 
+def test_a_body_that_is_not_compressed_as_it_says_is_no_news(caplog: pytest.LogCaptureFixture) -> None:
+    viser_internals.keep_tracebacks_short()
+
+    async def visit(door: Door, keys: list[str]) -> None:
+        sent = {"Content-Encoding": "gzip", "Origin": door.url.rstrip("/"), "Connection": "close"}
+        for path, status in (("nothing", 405), ("drop/x/file", 404)):
+            assert (await door.post(path, b"none", **sent)).status == status
+
+    through_an_echo(visit)
+    assert "Traceback" not in caplog.text
+
+
 def test_messages_pass_whole_in_both_directions() -> None:
     async def visit(door: Door, keys: list[str]) -> None:
         async with door.knock() as socket:

@@ -18,6 +18,7 @@ import numpy as np
 import viser
 import websockets.asyncio.server
 from aiohttp.http_exceptions import HttpProcessingError
+from aiohttp.web import RequestPayloadError
 from viser import _messages
 from viser._assignable_props_api import AssignablePropsBase
 
@@ -44,9 +45,9 @@ def tell_in_short(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> N
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """Not what was answered with a 400 already, nor that the other side has gone."""
+    """Not what was answered with a 400 already or is no body as its header says, nor that the other side has gone."""
     error = record.exc_info[1] if record.exc_info else None
-    return not isinstance(error, HttpProcessingError | ConnectionError)
+    return not isinstance(error, HttpProcessingError | RequestPayloadError | ConnectionError)
 
 
 def _in_short(record: logging.LogRecord) -> bool:
