@@ -8,7 +8,7 @@ from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.experiments.results import QueryResult
 from spherloc.frontend.view import View
 from spherloc.geometry import pose
-from spherloc_viz.app.controls.query_strip import end_of, ordered, strip_html, thumbnail
+from spherloc_viz.app.controls.query_strip import ORDERS, Strip, end_of, ordered, strip_html, thumbnail
 from spherloc_viz.layers.lens_view import through_lens
 
 LENS = KannalaBrandt(320, 320, 110.0, 110.0, 160.0, 160.0, (0.0, 0.0, 0.0, 0.0))
@@ -86,11 +86,13 @@ def test_the_strip_is_sorted_turned_and_told(tmp_path):
     assert [view.name for view in ordered(queries, rows, "inliers")[:2]] == ["<q11>", "<q07>"]
     assert ordered(queries, rows, "order") == queries
     shown = ordered(queries, rows, "outcome")[:24]
-    html = strip_html(shown, dict.fromkeys(names + [view.name for view in shown], ""), rows, "outcome", 0, 50, "m")
+    strip = Strip(shown, dict.fromkeys((view.name for view in shown), ""), rows, "<q11>", "m")
+    html = strip_html(strip, ORDERS, "outcome", 0, 50)
     assert "page 1 of 3" in html and "strip-page:1" in html and "<q30>" not in html and "&lt;q30&gt;: failed" in html
     assert html.count("strip-open:") == 24 and "9 of 80 matches" in html
     pressed = html.partition("strip-open:&lt;q00&gt;")[2].partition('role="listitem"')[0]
     assert pressed.endswith("&lt;q00&gt;</div></div></div><div "), "the name below a picture is part of its button"
+    assert html.count("aria-current") == 1 and 'aria-current="true" data-touch="strip-open:&lt;q11&gt;"' in html
     assert thumbnail(queries[0]) == ""
     cv2.imwrite(str(queries[0].path), np.full((320, 320, 3), 90, np.uint8))
     assert thumbnail(queries[0]).startswith("data:image/jpeg;base64,")

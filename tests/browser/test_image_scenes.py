@@ -246,8 +246,10 @@ def test_a_fisheye_is_opened_from_its_folder(images_tab: Playground, images_addr
     tab.touch("strip-open:query_001").click()
     expect(beside).to_be_visible()
     expect(tab.page.get_by_text(DOUBT, exact=True)).to_be_visible()
+    expect(tab.touch("strip-open:query_001")).to_have_attribute("aria-current", "true")
     tab.touch("strip-open:query_000").click()
     expect(beside).to_have_count(0)
+    expect(tab.touch("strip-open:query_000")).to_have_attribute("aria-current", "true")
     tab.press("Sphere")  # at the outcome, the view shows where the localized photograph was taken
     tab.until(lambda: is_visible(tab, "/sphere/image") and tab.node("/sphere/image") != panorama, "another image")
     tab.expect_quiet(images_address[0])

@@ -293,6 +293,8 @@ class Controls:
         html = _changes_html(run, self._catalog.synthetic(run.request.scene.scene), hidden)
         if self._edits.content != html:
             self._edits.content, self._edits.visible = html, bool(html)
+        images = self._catalog.map_scene(run.request.scene.scene)
+        self.sequence.mark("" if images is None else images.query(run.request.scene.query).name)
         self.compare.draw(run.trace, hidden)
         self.review.draw(run, diagnosis, hidden)
         for part in (self._sweep, self.sequence, self._recordings, self._export):

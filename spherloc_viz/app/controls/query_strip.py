@@ -7,6 +7,7 @@ import base64
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path, PurePosixPath
 
@@ -60,7 +61,7 @@ class QueryStrip:
         self._lock = threading.Lock()
         self._scene: MapScene | None = None
         self._rows: Mapping[str, QueryResult] = {}
-        self._order, self._page, self._hidden = "order", 0, False
+        self._order, self._page, self._hidden, self._marked = "order", 0, False, ""
         self._pictures: OrderedDict[Path, str] = OrderedDict()
         self._worker = BackgroundWorker("spherloc-strip", failed)
         touches.on("strip-order", self._sort)
@@ -71,12 +72,13 @@ class QueryStrip:
         """End it after the image at hand; does not wait."""
         self._worker.close()
 
-    def set(self, scene: MapScene | None, rows: Sequence[QueryResult], hidden: bool) -> None:
-        """Show the queries of a scene and what became of them by now; ``hidden`` tells no answers."""
+    def set(self, scene: MapScene | None, rows: Sequence[QueryResult], hidden: bool, marked: str) -> None:
+        """Show the queries of a scene and what became of them by now; ``hidden`` tells no answers, ``marked`` is the
+        name of the query that the page shows."""
         with self._lock:
             if scene is not self._scene:
                 self._page = 0
-            self._scene, self._hidden = scene, hidden
+            self._scene, self._hidden, self._marked = scene, hidden, marked
             self._rows = {row.query: row for row in rows}
         self._worker.ask(self._draw)
 
@@ -101,7 +103,7 @@ class QueryStrip:
     def _draw(self) -> None:
         with self._lock:
             scene, rows, order = self._scene, self._rows, self._order
-            hidden, page = self._hidden, self._page
+            hidden, page, marked = self._hidden, self._page, self._marked
         if scene is None:
             self._show("")
             return
@@ -110,7 +112,10 @@ class QueryStrip:
         page = min(page, (len(views) - 1) // PAGE)
         shown = views[page * PAGE : (page + 1) * PAGE]
         pictures = {view.name: self._picture(view) for view in shown}
-        self._show(strip_html(shown, pictures, known, order, page, len(views), "m" if scene.metric else "units"))
+        strip = Strip(shown, pictures, known, marked, "m" if scene.metric else "units")
+        untold = () if any(view.cam_from_map is not None for view in scene.queries) else ("error",)
+        orders = {key: words for key, words in ORDERS.items() if key not in untold}
+        self._show(strip_html(strip, orders, order, page, len(views)))
 
     def _picture(self, view: View) -> str:
         """Address of the view's thumbnail; empty if there is none yet."""
@@ -153,24 +158,30 @@ def ordered(queries: Sequence[View], rows: Mapping[str, QueryResult], order: str
     return list(queries) if order == "order" else sorted(queries, key=key)
 
 
-def strip_html(
-    shown: Sequence[View],
-    pictures: Mapping[str, str],
-    rows: Mapping[str, QueryResult],
-    order: str,
-    page: int,
-    count: int,
-    unit: str,
-) -> str:
-    """A page of the strip, and what sorts and turns it."""
+@dataclass(frozen=True, eq=False)
+class Strip:
+    """What a page of the strip shows."""
+
+    shown: Sequence[View]
+    pictures: Mapping[str, str]
+    """Addresses of the thumbnails by the names of the queries."""
+    rows: Mapping[str, QueryResult]
+    """What became of the queries, by their names."""
+    marked: str
+    """The query that the page shows."""
+    unit: str
+
+
+def strip_html(strip: Strip, orders: Mapping[str, str], order: str, page: int, count: int) -> str:
+    """A page of the strip, and what sorts and turns it: ``orders`` are words by their keys."""
     sorting = " · ".join(
-        f"<b>{words}</b>" if key == order else _pressed(f"strip-order:{key}", words) for key, words in ORDERS.items()
+        f"<b>{words}</b>" if key == order else _pressed(f"strip-order:{key}", words) for key, words in orders.items()
     )
     pages = (count - 1) // PAGE + 1
     turns = ((page - 1, "‹ before"), (page + 1, "after ›"))
     links = " ".join(_pressed(f"strip-page:{to}", words) for to, words in turns if 0 <= to < pages)
     turning = f'<div style="padding:.25em 0">page {page + 1} of {pages} {links}</div>' if pages > 1 else ""
-    cells = "".join(_cell(view, pictures[view.name], rows.get(view.name), unit) for view in shown)
+    cells = "".join(_cell(view, strip) for view in strip.shown)
     return box(
         f'<div style="{DIM};padding-bottom:.25em">Queries {sorting}</div>'
         f'<div style="display:flex;flex-wrap:wrap;gap:4px" role="list" aria-label="Queries">{cells}</div>{turning}',
@@ -182,7 +193,8 @@ def _pressed(action: str, words: str) -> str:
     return f'<u role="button" tabindex="0" data-touch="{action}" style="cursor:pointer">{words}</u>'
 
 
-def _cell(view: View, picture: str, row: QueryResult | None, unit: str) -> str:
+def _cell(view: View, strip: Strip) -> str:
+    picture, row = strip.pictures[view.name], strip.rows.get(view.name)
     mark, border = "", "1px dashed rgba(128,140,160,.6)"
     if row is not None:
         sign, color = MARKS[row.status]
@@ -191,7 +203,8 @@ def _cell(view: View, picture: str, row: QueryResult | None, unit: str) -> str:
             f'<span aria-hidden="true" style="position:absolute;right:0;bottom:0;padding:0 .3em;color:#fff;'
             f'background:rgba(20,24,32,.75);font-weight:700">{sign}</span>'
         )
-    said, width_px = said_of(view.name, row, unit), width_of(view.camera)
+    said, width_px = said_of(view.name, row, strip.unit), width_of(view.camera)
+    current, weight = (' aria-current="true"', "font-weight:700") if view.name == strip.marked else ("", DIM)
     image = (
         f'<img alt="" src="{picture}" style="display:block;height:{HEIGHT_PX}px">'
         if picture
@@ -200,10 +213,10 @@ def _cell(view: View, picture: str, row: QueryResult | None, unit: str) -> str:
     # As wide as the picture, to which it must not give a width of its own.
     wrapped = "width:0;min-width:100%;overflow-wrap:anywhere;line-height:1.15"
     words = escape(end_of(view.name, width_px))
-    name = f'<div aria-hidden="true" style="{wrapped};text-align:center;{DIM}">{words}</div>'
+    name = f'<div aria-hidden="true" style="{wrapped};text-align:center;{weight}">{words}</div>'
     framed = f"position:relative;border:{border};border-radius:4px;overflow:hidden"
     return (
-        f'<div role="listitem"><div role="button" tabindex="0" data-touch="strip-open:{escape(view.name)}" '
+        f'<div role="listitem"><div role="button" tabindex="0"{current} data-touch="strip-open:{escape(view.name)}" '
         f'title="{escape(said)}" aria-label="{escape(said)}" style="cursor:pointer">'
         f'<div style="{framed}">{image}{mark}</div>{name}</div></div>'
     )

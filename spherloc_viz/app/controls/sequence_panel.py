@@ -57,6 +57,7 @@ class SequencePanel:
         self._rows: dict[str, tuple[QueryResult, ...]] = {}
         """By the label of the scene."""
         self._shown: tuple[str, MapScene | None] = ("", None)
+        self._query = ""
         self._hidden = False
         self._strip = QueryStrip(touches, self._show_pictures, open_query, self._complain)
 
@@ -88,6 +89,12 @@ class SequencePanel:
         self._follow()
         self._done(None, False)
 
+    def mark(self, query: str) -> None:
+        """Say which query the page shows; empty for none."""
+        if query != self._query:
+            self._query = query
+            self._follow()
+
     def hide_answers(self, hidden: bool) -> None:
         """Hide the results, or show them again."""
         if self._text.visible == hidden:
@@ -99,7 +106,7 @@ class SequencePanel:
     def _follow(self) -> None:
         """The strip shows the scene at hand, and what became of its queries."""
         label, scene = self._shown
-        self._strip.set(scene, self.rows(label), self._hidden)
+        self._strip.set(scene, self.rows(label), self._hidden, self._query)
 
     def _show_pictures(self, html: str) -> None:
         if self._pictures.content != html:
