@@ -32,14 +32,13 @@ def address(tmp_path_factory: pytest.TempPathFactory, recordings: Path) -> Itera
         yield found
 
 
-HERE = Path(__file__).parent
 _browsers: list[Browser] = []
 _at_end = ExitStack()
 
 
 @pytest.fixture(scope="module")
 def browser() -> Browser:
-    """A headless Chromium with WebGL in software, kept for the next file here: a new one costs 5 s."""
+    """A headless Chromium with WebGL in software, kept for the next file: a new one costs 5 s."""
     if not _browsers:
         path = find_chromium()
         playwright = _at_end.enter_context(sync_playwright())
@@ -55,9 +54,9 @@ def _close_browser() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(nextitem: pytest.Item | None) -> Generator[None, object, object]:
-    """The browser is not kept for tests elsewhere: Playwright's event loop blocks others."""
+    """The browser is not kept for tests without one: Playwright's event loop blocks others."""
     result = yield
-    if nextitem is None or HERE not in nextitem.path.parents:
+    if not isinstance(nextitem, pytest.Function) or "browser" not in nextitem.fixturenames:
         _close_browser()
     return result
 
