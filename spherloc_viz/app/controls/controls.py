@@ -199,7 +199,8 @@ class Controls:
             gui.add_html(heading_html("From where on does an estimator fail?", "sweep"))
             self._sweep = SweepPanel(gui, touches, self._chosen_sweep, services.recorder)
         with self._tab(gui, tabs, "Open"):
-            gui.add_html(heading_html("Other scenes, your own photographs, and your own matches", "scene"))
+            about = "Other scenes, your own matches, and your own photographs: drop a folder onto the page"
+            gui.add_html(heading_html(about, "scene"))
             self._open = OpenPanel(
                 gui, client, touches, services.roots, self._open_scene, self._scene_file, drops=services.drops
             )
