@@ -10,7 +10,6 @@ in exposure, colour, sharpness and noise. Maps are compared with the truth as by
 ``colmap``.
 """
 
-import argparse
 import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,8 +18,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.judged_pairs import judged_pairs, print_table
-from benchmarks.maps import cells, uneven
+from benchmarks.judged_pairs import judged_pairs
+from benchmarks.maps import cells, print_tables, uneven
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.geometry import camera_centre, pose
 from spherloc.types import FloatArray
@@ -82,17 +81,7 @@ def pairs_of(one: str, features: str) -> list[tuple[float, bool]]:
 
 def main() -> None:
     """Print the table."""
-    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("sets", nargs="*", default=SETS, metavar="WORLD:SEED:LENS")
-    words.add_argument("--features", default="sift")
-    words.add_argument("--pairs", action="store_true")
-    given = words.parse_args()
-    if given.pairs:
-        print_table([pair for one in given.sets for pair in pairs_of(one, given.features)])
-        return
-    print("| fisheyes | maps of | right | wrong | median of the right ones, cm |\n|---|---|---|---|---|")
-    for one in given.sets:
-        print(row(one, given.features), flush=True)
+    print_tables(__doc__, "WORLD:SEED:LENS", SETS, row, pairs_of)
 
 
 if __name__ == "__main__":

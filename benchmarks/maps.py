@@ -14,7 +14,7 @@ an image that is then more than ``WRONG_M`` off is wrong. Maps of two images are
 """
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -194,19 +194,30 @@ def parts_of(one: str) -> tuple[str, int, int, str]:
     return world, int(count), int(more[0]) if more else 0, more[1] if len(more) > 1 else ""
 
 
-def main() -> None:
-    """Print the table."""
-    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("sets", nargs="*", default=SETS, metavar="WORLD:COUNT[:SEED[:CHANGE]]")
+def print_tables(
+    description: str | None,
+    metavar: str,
+    sets: Sequence[str],
+    row: Callable[[str, str], str],
+    pairs_of: Callable[[str, str], list[tuple[float, bool]]],
+) -> None:
+    """Print a table of maps or of pairs, as the command line says; ``row`` and ``pairs_of`` take a set and features."""
+    words = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    words.add_argument("sets", nargs="*", default=sets, metavar=metavar)
     words.add_argument("--features", default="sift")
     words.add_argument("--pairs", action="store_true")
     given = words.parse_args()
     if given.pairs:
         print_table([pair for one in given.sets for pair in pairs_of(one, given.features)])
         return
-    print("| panoramas | maps of | right | wrong | median of the right ones, cm |\n|---|---|---|---|---|")
+    print("| images | maps of | right | wrong | median of the right ones, cm |\n|---|---|---|---|---|")
     for one in given.sets:
         print(row(one, given.features), flush=True)
+
+
+def main() -> None:
+    """Print the table."""
+    print_tables(__doc__, "WORLD:COUNT[:SEED[:CHANGE]]", SETS, row, pairs_of)
 
 
 if __name__ == "__main__":
