@@ -43,6 +43,8 @@ class Kind:
     """Whether the extra ``learned`` brings its weights, so that no file is needed."""
     most: int = 8000
     """Number of features that are kept, the strongest, unless the options give another."""
+    on_face: Run | None = None
+    """Finds them on one of the faces of a panorama; None if that is not done in another way."""
     weak: Run | None = None
     """Finds weaker ones, too; None if this kind has no threshold for that."""
     strong: float = -np.inf
@@ -50,10 +52,16 @@ class Kind:
 
 
 def detect(
-    method: str, image: ByteArray, mask: ByteArray, most: int, weights: Path | None, weak: bool = False
+    method: str,
+    image: ByteArray,
+    mask: ByteArray,
+    most: int,
+    weights: Path | None,
+    on_face: bool = False,
+    weak: bool = False,
 ) -> tuple[FloatArray, Descriptors]:
     """Features of an image, (H, W) or (H, W, 3) BGR, at the non-zero pixels of ``mask`` (H, W), with ``weak`` also
-    those that this kind otherwise leaves out.
+    those that this kind otherwise leaves out. ``on_face`` says that the image is one of the faces of a panorama.
 
     Returns keypoints (N, 5): pixel u, v with the first pixel's centre at (0.5, 0.5), size px, angle rad, score; and
     descriptors (N, D). There may be more than ``most`` features. Raises ``InputError`` if this OpenCV lacks the method
@@ -61,7 +69,7 @@ def detect(
     """
     if min(mask.shape) >= SMALLEST_PX and mask.any():
         kind = KINDS[method]
-        run = kind.weak if weak and kind.weak is not None else kind.run
+        run = (kind.weak if weak else None) or (kind.on_face if on_face else None) or kind.run
         keypoints, descriptors = run(image, mask, most, weights)
         if descriptors is not None and len(keypoints) > 0:
             return keypoints, descriptors
@@ -133,8 +141,10 @@ def _contributed(name: str) -> Any:
     return getattr(getattr(cv2, "xfeatures2d", None), name, None)
 
 
-def _aliked(image: ByteArray, mask: ByteArray, most: int, weights: Path | None) -> tuple[FloatArray, Any]:
-    return trained.aliked(image, most) if weights is None else learned.aliked(image, mask, most, weights)
+def _aliked(
+    image: ByteArray, mask: ByteArray, most: int, weights: Path | None, on_face: bool = False
+) -> tuple[FloatArray, Any]:
+    return trained.aliked(image, most, on_face) if weights is None else learned.aliked(image, mask, most, weights)
 
 
 KINDS = {
@@ -149,6 +159,6 @@ KINDS = {
     "orb": Kind(_orb, reach=0.2, binary=True),
     "akaze": Kind(_akaze, reach=0.7, binary=True),
     "surf": Kind(_surf, reach=0.5),
-    "aliked": Kind(_aliked, reach=1.0, learned=True, packaged=True, most=2048),
+    "aliked": Kind(_aliked, reach=1.0, learned=True, packaged=True, most=2048, on_face=partial(_aliked, on_face=True)),
     "disk": Kind(learned.disk, reach=1.0, learned=True, most=2048),
 }

@@ -23,7 +23,7 @@ from spherloc.frontend.view import View
 from spherloc.images import MAX_BYTES
 from spherloc.types import BoolArray, ByteArray, FloatArray
 
-VERSION = 6
+VERSION = 7
 """Number to be increased when the same options give other features, so that old files are not used."""
 
 
@@ -255,7 +255,7 @@ def _on_faces(
     faces = panorama_faces(panorama, FACE_SHARPNESS, MAX_FACE_PIXELS)
     tables, parts = [], []
     for face in range(len(faces)):
-        table, descriptors = _detected(*faces.cut(face, image, usable), options, weak)
+        table, descriptors = _detected(*faces.cut(face, image, usable), options, weak, on_face=True)
         tables.append(_on_panorama(table, faces, face))
         parts.append(descriptors)
     table = np.concatenate(tables)
@@ -298,13 +298,18 @@ def _on_panorama(table: FloatArray, faces: Faces, face: int) -> FloatArray:
 
 
 def _detected(
-    image: ByteArray, usable: ByteArray, wanted: BoolArray, options: FeatureOptions, weak: bool
+    image: ByteArray,
+    usable: ByteArray,
+    wanted: BoolArray,
+    options: FeatureOptions,
+    weak: bool,
+    on_face: bool = False,
 ) -> tuple[FloatArray, Descriptors]:
     """Keypoints (N, 5) and descriptors of a flat image, with masks (H, W) of the usable and of the wanted pixels."""
     kind = KINDS[options.method]
     room = _room_px(usable)
     mask = (wanted & (room > RIM_PX)).astype(np.uint8)
-    table, descriptors = detect(options.method, image, mask, options.most, options.weights, weak)
+    table, descriptors = detect(options.method, image, mask, options.most, options.weights, on_face, weak)
     kept = _usable_rows(table, descriptors, np.where(wanted, room, np.float32(0.0)), kind.reach)
     return table[kept], descriptors[kept]
 

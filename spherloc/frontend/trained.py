@@ -20,8 +20,12 @@ from spherloc.files import is_file, read_file
 from spherloc.registry import require
 from spherloc.types import ByteArray, FloatArray
 
-INPUT_PX = 640
-"""Longer side to which larger images are shrunk: it takes a second on two cores; 1,024 pixels take three."""
+INPUT_PX = 1024
+"""Longer side to which images are scaled, small ones too: a keypoint is exact to a share of a pixel of the network. At
+640 pixels, a third of the time, poses of fisheyes of 640 pixels were up to half as exact again as by SIFT
+(``python -m benchmarks.features_pose``)."""
+FACE_PX = 640
+"""Longer side to which larger faces of a panorama are shrunk: there are twelve of them."""
 MIN_SCORE = 0.01
 """Least score of a keypoint. The authors' 0.2 leaves too few in dim rooms: between the cameras of a pair of glasses,
 0.01 gives up to 1.6 times as many right matches as 0.05 (``python -m benchmarks.features --method aliked``)."""
@@ -54,16 +58,18 @@ def check_installed(name: str) -> None:
         )
 
 
-def aliked(image: ByteArray, most: int) -> tuple[FloatArray, NDArray[np.float32]]:
+def aliked(image: ByteArray, most: int, on_face: bool) -> tuple[FloatArray, NDArray[np.float32]]:
     """The strongest ALIKED features (Zhao et al. 2023): keypoints (N, 5) as in ``feature_kinds.detect``, descriptors.
 
-    No mask is used, since the network takes none. Raises ``InputError`` if the extra is not installed, or if its
-    versions are not those that were tested.
+    ``on_face`` says that the image is one of the faces of a panorama. No mask is used, since the network takes none.
+    Raises ``InputError`` if the extra is not installed, or if its versions are not those that were tested.
     """
     torch, network, _ = _networks()
-    scale = min(1.0, INPUT_PX / max(image.shape[:2]))
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
-    colour = cv2.cvtColor(small, cv2.COLOR_BGR2RGB if small.ndim == 3 else cv2.COLOR_GRAY2RGB)
+    longer = max(image.shape[:2])
+    scale = min(1.0, FACE_PX / longer) if on_face else INPUT_PX / longer
+    filtered = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
+    scaled = cv2.resize(image, None, fx=scale, fy=scale, interpolation=filtered)
+    colour = cv2.cvtColor(scaled, cv2.COLOR_BGR2RGB if scaled.ndim == 3 else cv2.COLOR_GRAY2RGB)
     pixels = torch.from_numpy(np.ascontiguousarray(colour.transpose(2, 0, 1))).float()[None] / 255.0
     with _one_at_a_time, torch.inference_mode():
         found = network({"image": pixels.to(_device(torch))})
@@ -71,7 +77,7 @@ def aliked(image: ByteArray, most: int) -> tuple[FloatArray, NDArray[np.float32]
             found[key][0].cpu().numpy() for key in ("keypoints", "keypoint_scores", "descriptors")
         )
     strongest = np.argsort(-scores, kind="stable")[:most]
-    step = np.array(image.shape[1::-1]) / np.array(small.shape[1::-1])
+    step = np.array(image.shape[1::-1]) / np.array(scaled.shape[1::-1])
     rows = np.zeros((len(strongest), 5))
     rows[:, :2] = (places[strongest] + 0.5) * step  # the network has the first pixel's centre at 0
     rows[:, 2], rows[:, 4] = step.mean(), scores[strongest]

@@ -9,10 +9,12 @@ from scipy.spatial import cKDTree
 
 from spherloc.errors import InputError
 from spherloc.frontend import features as module
+from spherloc.frontend import trained
 from spherloc.frontend.feature_kinds import SIFT_CONTRAST, WEAK_SIFT_CONTRAST
 from spherloc.frontend.features import ENOUGH, FeatureOptions, extract
 from spherloc.frontend.matching import match
 from tests.frontend.pictures import blobs, disc, fisheye, fisheye_of, texture, view_of
+from tests.needs import require
 
 CLASSICAL = ("sift", "orb")
 """What every OpenCV has, without weights."""
@@ -198,6 +200,22 @@ def test_features_match_across_the_seam(tmp_path, rng):
     assert right.mean() > 0.97
 
 
+@pytest.mark.parametrize("panorama", [False, True])
+def test_packaged_features_lie_at_the_same_places_in_a_smaller_image(tmp_path, rng, panorama):
+    """Whether it is enlarged for the network or shrunk, or a panorama cut into faces."""
+    require("learned")
+    image = cv2.GaussianBlur(texture(rng, 700, 1400), (0, 0), 2.0)
+    small = np.asarray(cv2.resize(image, (700, 350), interpolation=cv2.INTER_AREA), np.uint8)
+    cameras = (None, None) if panorama else (fisheye_of(1400, 700), fisheye_of(700, 350))
+    options = FeatureOptions("aliked")
+    found = extract(view_of(tmp_path, image, cameras[0], "large.png"), options)
+    others = extract(view_of(tmp_path, small, cameras[1], "small.png"), options)
+    index, distance = nearest(others.pixels * 2.0, found.pixels)
+    same = distance < 2.0
+    assert same.mean() > 0.3
+    assert np.abs(np.median((others.pixels * 2.0 - found.pixels[index])[same], axis=0)).max() < 0.1
+
+
 def test_large_images_are_shrunk_for_detection(tmp_path, rng, monkeypatch):
     """Their features are still given in the image's own pixels, also where the sides shrink unlike each other."""
     monkeypatch.setattr(module, "MAX_PIXELS", 160_003)
@@ -222,7 +240,8 @@ def test_large_images_are_shrunk_for_detection(tmp_path, rng, monkeypatch):
         ({"weights": Path("a.onnx")}, "sift features have no weights"),
     ],
 )
-def test_wrong_options(options, reason):
+def test_wrong_options(monkeypatch, options, reason):
+    monkeypatch.setattr(trained, "installed", lambda: False)
     with pytest.raises(InputError, match=reason):
         FeatureOptions(**options)
 
