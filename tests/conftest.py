@@ -119,6 +119,17 @@ def own_examiner() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def server() -> Iterator[Any]:
+    """A viser server of one file's tests, on a free port."""
+    from spherloc_viz.app.web.viser_internals import start_viser, stop_viser  # only tests of the page need them
+    from tests.connected_page import KEY
+
+    server = start_viser(KEY)
+    yield server
+    stop_viser(server)
+
+
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures of trajectories are empty files, where a test looks at other files: each takes the better part of a

@@ -15,6 +15,8 @@ from spherloc_viz.app.web.access import Role
 from spherloc_viz.app.web.viser_internals import KEY_HEADER, LINK_HEADER, ROLE_HEADER
 from tests.waiting import LIMIT_S, until
 
+KEY = "a key of this test"
+"""That of a viser server of tests."""
 HELLO = {
     "type": "ViewerCameraMessage",
     "wxyz": (1.0, 0.0, 0.0, 0.0),

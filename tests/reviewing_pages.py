@@ -14,11 +14,9 @@ from spherloc_viz.app.session import Session
 from spherloc_viz.app.web.touch import Touch
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.recording.storage.recorder import Recorder
-from tests.connected_page import ConnectedPage
+from tests.connected_page import KEY, ConnectedPage
 from tests.tiny_scene import write_tiny_scene
 from tests.waiting import until
-
-KEY = "a key of this test"
 
 
 class Office:

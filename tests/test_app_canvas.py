@@ -22,10 +22,8 @@ from spherloc_viz.app.stage.canvas import Canvas
 from spherloc_viz.app.stage.walls import Walls
 from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
-from tests.connected_page import HELLO, ConnectedPage
+from tests.connected_page import HELLO, KEY, ConnectedPage
 from tests.waiting import LIMIT_S, until
-
-KEY = "a key of this test"
 
 
 @pytest.fixture

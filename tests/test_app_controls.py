@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,7 +25,6 @@ from spherloc_viz.app.controls.estimator_controls import EstimatorControls
 from spherloc_viz.app.controls.presets import presets
 from spherloc_viz.app.controls.scene_controls import CHANGED, LISTED_QUERIES, SceneControls
 from spherloc_viz.app.controls.simulation_controls import KINDS, SIMULATED
-from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from tests.datasets.test_rendered import SMALL
 
 CATALOG = Catalog(None)
@@ -38,13 +36,6 @@ class Press:
     """What viser gives to a callback when a person did something."""
 
     client: object = "somebody"
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = start_viser("a key of this test")
-    yield server
-    stop_viser(server)
 
 
 @pytest.fixture(scope="module")

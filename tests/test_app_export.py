@@ -20,14 +20,12 @@ from spherloc.estimators import estimate
 from spherloc_viz.app.panels import export_panel
 from spherloc_viz.app.panels.export_panel import CANVAS, ExportPanel, Shown, code_html, file_stem, picture_png
 from spherloc_viz.app.stage.still_page import Still, still_html
-from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.recording.content.data import read_recording
-from tests.connected_page import ConnectedPage
+from tests.connected_page import KEY, ConnectedPage
 from tests.waiting import until
 
 EVIL = '</script><img src=x onerror="alert(1)">&'
-KEY = "a key of this test"
 
 
 @pytest.fixture(scope="module")
@@ -35,13 +33,6 @@ def shown(scene_of: Callable[..., SyntheticScene]) -> Shown:
     trace = estimate(scene_of("panorama", correspondences=25, outlier_rate=0.4).problem(1), "mc")
     picture = paint(trace, len(steps(trace)) - 1)
     return Shown(trace, picture.scene, None, "Small street, 40 %", "mc on 25 matches", None, dark=True)
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = start_viser(KEY)
-    yield server
-    stop_viser(server)
 
 
 @pytest.fixture

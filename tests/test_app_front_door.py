@@ -28,9 +28,9 @@ from spherloc_viz.app.web.drops import DropRoom
 from spherloc_viz.app.web.front_door import FrontDoor
 from spherloc_viz.app.web.page import load_page
 from spherloc_viz.app.web.viewer import ViewerRoom
+from tests.connected_page import KEY
 from tests.waiting import LIMIT_S
 
-KEY = "a key of this test"
 VERSION = f"viser-v{viser.__version__}"
 
 

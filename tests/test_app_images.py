@@ -2,7 +2,7 @@
 
 import base64
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,20 +23,12 @@ from spherloc_viz.app.matches import match_drawing as drawing
 from spherloc_viz.app.matches.image_panel import MAX_BYTES, ImagePanel, photo_uri
 from spherloc_viz.app.matches.match_card import CROP_HEIGHT_PX, CROP_WIDTH_PX, SIDE_PX, MatchCard, crops_html
 from spherloc_viz.app.matches.match_table import MatchTablePanel, chips_html
-from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.matches import match_view, valid_outlines
 from spherloc_viz.layers.primitives import Picture, Points
 
 SceneOf = Callable[..., SyntheticScene]
 EVIL = "<img src=x onerror=alert(1)>"
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = start_viser("a key of this test")
-    yield server
-    stop_viser(server)
 
 
 @pytest.fixture

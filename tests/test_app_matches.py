@@ -1,7 +1,7 @@
 """The card and the table of the matches: what they show and what a press means."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,17 +16,9 @@ from spherloc_viz import style
 from spherloc_viz.app.matches.image_panel import ImagePanel
 from spherloc_viz.app.matches.match_card import MatchCard
 from spherloc_viz.app.matches.match_table import PAGE, MatchTablePanel
-from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import paint
 
 SceneOf = Callable[..., SyntheticScene]
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = start_viser("a key of this test")
-    yield server
-    stop_viser(server)
 
 
 @pytest.fixture

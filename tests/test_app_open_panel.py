@@ -19,13 +19,11 @@ from spherloc_viz.app.panels.open_panel import OpenedScene, OpenPanel, RecentSce
 from spherloc_viz.app.panels.uploads import MAX_BYTES
 from spherloc_viz.app.web.drops import DropRoom
 from spherloc_viz.app.web.touch import Touch, Touches
-from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
-from tests.connected_page import ConnectedPage
+from tests.connected_page import KEY, ConnectedPage
 from tests.datasets.colmap_samples import EQUIRECTANGULAR, binary_files, sample_model, write
 from tests.waiting import until
 
 ROOT = Path(__file__).resolve().parents[1]
-KEY = "a key of this test"
 CAMERA = '[camera]\nmodel = "equirectangular"\nwidth = 512\nheight = 256\n'
 CSV = "u,v,X,Y,Z\n" + "".join(f"{20 * k + 5},{90 + 7 * k},{k - 5},{k % 3},{4 + k % 5}\n" for k in range(12))
 SCENE = f"""
@@ -86,13 +84,6 @@ class Visitor:
     def close(self) -> None:
         self.panel.close()
         self.page.close()
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = start_viser(KEY)
-    yield server
-    stop_viser(server)
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """The painter changes what is on the canvas instead of drawing it anew, and hides what a picture does not show."""
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from types import SimpleNamespace
@@ -14,7 +13,6 @@ import viser
 
 from spherloc_viz import style
 from spherloc_viz.app.stage.painter import LARGEST_DOT, LARGEST_DOT_INSIDE, MAX_BATCHED, SHELLS, Painter
-from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers.frame import one_color
 from spherloc_viz.layers.primitives import Balls, Label, Mesh, Points, Segments, Textured
 from spherloc_viz.layers.selection import HALO
@@ -53,13 +51,6 @@ class Client:
 
     scene: Any
     atomic: Any
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = start_viser("a key of this test")
-    yield server
-    stop_viser(server)
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -26,7 +26,6 @@ from spherloc_viz.app.controls.steps_panel import find_step
 from spherloc_viz.app.stage import views
 from spherloc_viz.app.stage.painter import light_bytes, surface_bytes
 from spherloc_viz.app.text import cause_html, evidence_html, key_step_html, status_html, step_html, table_html
-from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.app.workers import LatestWorker
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.primitives import Balls, Points, Step, StepHeading, Table
@@ -175,13 +174,6 @@ def test_estimators_are_offered_in_their_order() -> None:
     labels = estimator_labels(names)
     assert list(labels.values()) == ["mc-exact", "mc", "ransac-2p", "auto", "ransac-epnp", "ransac-svd", "zebra"]
     assert all(label.startswith(name) for label, name in labels.items()) and len(labels) == len(names)
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = start_viser("a key of this test")
-    yield server
-    stop_viser(server)
 
 
 @dataclasses.dataclass(frozen=True)

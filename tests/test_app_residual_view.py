@@ -1,7 +1,7 @@
 """The residual view on a real server: heights, presses and what is sent."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from html import unescape
 from xml.etree import ElementTree
@@ -22,20 +22,12 @@ from spherloc_viz.app.plots.residual_view import (
     residuals_caption,
 )
 from spherloc_viz.app.plots.shapes import Scale
-from spherloc_viz.app.server import start_viser, stop_viser
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers.refinement import chart
 from spherloc_viz.layers.residuals import history_of, residuals_of
 
 SVG = "{http://www.w3.org/2000/svg}"
 SceneOf = Callable[..., SyntheticScene]
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = start_viser("a key of this test")
-    yield server
-    stop_viser(server)
 
 
 @pytest.fixture(scope="module")

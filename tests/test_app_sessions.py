@@ -35,11 +35,10 @@ from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers.primitives import Picture
 from spherloc_viz.recording.origin import Origin
 from spherloc_viz.recording.storage.recorder import Ended
-from tests.connected_page import HELLO, Wire
+from tests.connected_page import HELLO, KEY, Wire
 from tests.tiny_scene import write_tiny_scene
 from tests.waiting import LIMIT_S, until
 
-KEY = "a key of this test"
 ALTERNATIVE = np.column_stack([np.eye(3), [1.0, 2.0, 3.0]])
 
 

@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Iterator
 from xml.etree import ElementTree
 
 import numpy as np
@@ -15,7 +14,6 @@ from spherloc_viz import style
 from spherloc_viz.app.plots import shapes
 from spherloc_viz.app.plots.charts import MAX_STEPS, ChartPanel, chart_html, chart_svg, curve_parts
 from spherloc_viz.app.plots.shapes import MINUS, Scale, decade_ticks, round_ticks, tick_texts, wrapped_deg
-from spherloc_viz.app.server import start_viser, stop_viser
 from spherloc_viz.layers.primitives import Chart, Curve
 
 EVIL = '<img src=x onerror="alert(1)">&\'"'
@@ -232,13 +230,6 @@ def test_legends_do_not_run_out_of_the_drawing(width: float) -> None:
     for row in rows.values():
         ends = [left + shapes.text_width_px(name) for left, name in row]
         assert max(ends) <= width and all(end < left for end, (left, _) in zip(ends, row[1:], strict=False))
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = start_viser("a key of this test")
-    yield server
-    stop_viser(server)
 
 
 def test_the_panel_sends_charts_when_they_change_and_only_then(server: viser.ViserServer) -> None:

@@ -1,6 +1,5 @@
 """The handle on the true camera: what it tells is the pose that it shows, and dragging wins over our own updates."""
 
-from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, Literal, cast
 
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 
 from spherloc.geometry import pose, yaw_rotation
 from spherloc_viz.app.stage.true_camera import Place, TrueCamera, place_of, pose_of
-from spherloc_viz.app.web.viser_internals import changes_of, start_viser, stop_viser
+from spherloc_viz.app.web.viser_internals import changes_of
 
 metres = st.floats(-1e3, 1e3)
 
@@ -58,13 +57,6 @@ class Hand:
 
 
 NODES = ("/true camera level", "/true camera upright")
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = start_viser("a key of this test")
-    yield server
-    stop_viser(server)
 
 
 @pytest.fixture

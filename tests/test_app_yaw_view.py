@@ -1,7 +1,7 @@
 """The yaw view: arcs against Eq. 22 by brute force, rows that do not collide, windows across the seam, and presses."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +22,6 @@ from spherloc.geometry import yaw_rotation
 from spherloc.problem import Problem
 from spherloc.trace import RansacStage, Trace, YawStage
 from spherloc_viz.app.plots.yaw_view import PEAK, WHOLE, YawView, bars_html, yaw_svg
-from spherloc_viz.app.server import start_viser, stop_viser
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.yaw_story import (
@@ -51,13 +50,6 @@ SceneOf = Callable[..., SyntheticScene]
 def runs(scene_of: SceneOf) -> dict[str, Trace]:
     problem = scene_of("mei", correspondences=120, outlier_rate=0.8).problem()
     return {name: estimate(problem, name, seed=1) for name in ("mc", "mc-exact", "ransac-2p")}
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = start_viser("a key of this test")
-    yield server
-    stop_viser(server)
 
 
 def roots_deg(problem: Problem, i: int, j: int) -> list[float]:

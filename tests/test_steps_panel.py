@@ -2,7 +2,6 @@
 
 import gc
 import warnings
-from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -35,13 +34,6 @@ TIMELINE = (
     StepHeading("outcome", "Outcome", "Outcome"),
 )
 KEYS = [heading.key for heading in TIMELINE]
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[viser.ViserServer]:
-    server = start_viser("a key")
-    yield server
-    stop_viser(server)
 
 
 def event(widget: Any, client: object | None = object()) -> Any:

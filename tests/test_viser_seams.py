@@ -16,10 +16,9 @@ from spherloc_viz.app.web.viser_internals import (
     start_viser,
     stop_viser,
 )
-from tests.connected_page import HELLO, ConnectedPage
+from tests.connected_page import HELLO, KEY, ConnectedPage
 from tests.waiting import until
 
-KEY = "a key of this test"
 THREADS, ROUNDS, MESSAGES = 4, 30, 20
 
 

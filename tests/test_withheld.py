@@ -23,9 +23,8 @@ from spherloc_viz.app.web.viser_internals import start_viser, stop_viser
 from spherloc_viz.layers import steps
 from spherloc_viz.layers.frame import RunView
 from spherloc_viz.layers.withheld import ANSWERS, HIDDEN, ONLY_OUTCOME, untold
-from tests.connected_page import ConnectedPage
+from tests.connected_page import KEY, ConnectedPage
 
-KEY = "a key of this test"
 SEEN = "views:Charts,Graph,Images,Matches,Residuals,Yaw;Yaw;"
 WRONG = 0.63
 """Share of wrong matches: a number that nothing else on the page has."""

@@ -28,9 +28,9 @@ from spherloc_viz.app.web.viser_internals import (
     start_viser,
     stop_viser,
 )
+from tests.connected_page import KEY
 from tests.waiting import LIMIT_S
 
-KEY = "a key of this test"
 HANDLE = "/handle"
 
 

@@ -157,3 +157,24 @@ def random_directions(seed: int, count: int) -> np.ndarray:
 def angle_rad(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angle between rows of (N, 3), exact for small angles."""
     return np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))
+
+
+def check_invertible(camera: Camera, seed: int, more: np.ndarray | None = None, bound_px: float = 1e-6) -> None:
+    """Pixels in and around an image of 800 x 700, and directions, are found again exactly where the camera says that
+    they are seen, and the image is nowhere mirrored, as it would be beyond a fold. All of ``more`` (N, 3) are seen."""
+    pixels = np.random.default_rng(seed).uniform([-200, -200], [1000, 900], size=(300, 2))
+    bearings, seen = camera.unproject(pixels)
+    again, valid = camera.project(bearings)
+    np.testing.assert_array_equal(valid, seen)
+    assert np.abs(again - pixels)[seen].max(initial=0.0) < bound_px
+    np.testing.assert_allclose(np.linalg.norm(bearings[seen], axis=1), 1.0, atol=1e-12)
+    points = np.vstack([random_directions(seed, 300), np.empty((0, 3)) if more is None else more])
+    pixels, valid = camera.project(points)
+    assert valid[300:].all()
+    bearings, seen = camera.unproject(pixels)
+    np.testing.assert_array_equal(seen, valid)
+    assert angle_rad(bearings[seen], points[seen]).max(initial=0.0) < 1e-5
+    jacobian = camera.unprojection_jacobian(pixels)
+    np.testing.assert_array_equal(np.isfinite(jacobian).all(axis=(1, 2)), seen)
+    orientation = np.sum(np.cross(jacobian[:, :, 0], jacobian[:, :, 1]) * bearings, axis=1)
+    assert (orientation[seen] > 0).all()

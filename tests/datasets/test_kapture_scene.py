@@ -180,6 +180,19 @@ def test_wrong_keys(tmp_path, rest, said):
         small(tmp_path, rest)
 
 
+def recorded(folder, steps, cameras, sensors, rigs, trajectories):
+    """A folder of kapture in which each camera takes an image at each step."""
+    records = [(step, name, f"{name}/{step}.jpg") for step in steps for name in cameras]
+    return write_kapture(
+        folder / "data",
+        [image for *_, image in records],
+        sensors=sensors,
+        rigs=rigs,
+        trajectories=trajectories,
+        records_camera="".join(f"{time}, {name}, {image}\n" for time, name, image in records),
+    )
+
+
 def test_points_come_from_rig_partners_first_and_from_ever_farther_away(tmp_path):
     """A straight drive with two cameras ahead and one backwards: 1, 2, 4 and 8 m away, never what looks elsewhere."""
     sensors = "".join(
@@ -188,15 +201,7 @@ def test_points_come_from_rig_partners_first_and_from_ever_farther_away(tmp_path
     rigs = "car, left, 1, 0, 0, 0, 0.25, 0, 0\ncar, right, 1, 0, 0, 0, -0.25, 0, 0\ncar, back, 0, 0, 1, 0, 0, 0, 0\n"
     steps = range(30)
     trajectories = "".join(f"{step}, car, 1, 0, 0, 0, 0, 0, {-step}\n" for step in steps)
-    records = [(step, name, f"{name}/{step}.jpg") for step in steps for name in ("left", "right", "back")]
-    root = write_kapture(
-        tmp_path / "data",
-        [image for *_, image in records],
-        sensors=sensors,
-        rigs=rigs,
-        trajectories=trajectories,
-        records_camera="".join(f"{time}, {name}, {image}\n" for time, name, image in records),
-    )
+    root = recorded(tmp_path, steps, ("left", "right", "back"), sensors, rigs, trajectories)
     scene = scene_of(tmp_path, root, 'queries = ["left/29.jpg"]')
     lifts = {view.name: names(view.lift.others) for view in scene.references}
     partner, *others = lifts["left/0.jpg"]
@@ -215,15 +220,7 @@ def test_panoramas_that_look_back_are_partners_too(tmp_path):
     trajectories = "".join(
         f"{at}, robot, {back}, {at}\n" if at % 2 else f"{at}, robot, {ahead}, {-at}\n" for at in steps
     )
-    records = [(step, name, f"{name}/{step}.jpg") for step in steps for name in ("top", "low")]
-    root = write_kapture(
-        tmp_path / "data",
-        [image for *_, image in records],
-        sensors=sensors,
-        rigs=rigs,
-        trajectories=trajectories,
-        records_camera="".join(f"{time}, {name}, {image}\n" for time, name, image in records),
-    )
+    root = recorded(tmp_path, steps, ("top", "low"), sensors, rigs, trajectories)
     scene = scene_of(tmp_path, root, 'queries = ["top/9.jpg"]\n[gravity]\nmap = [0, 1, 0]')
     lifts = {view.name: names(view.lift.others) for view in scene.references}
     partner, *others = lifts["top/0.jpg"]
