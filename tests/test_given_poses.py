@@ -28,6 +28,7 @@ from spherloc_viz.options import usable_estimators
 from spherloc_viz.recording.content.data import read_recording
 from spherloc_viz.recording.replay import repeat
 from spherloc_viz.recording.review_file import read_review
+from tests.datasets.hloc_samples import QUERY, make_world, write_all
 
 NAME = "mei_outliers_80"
 
@@ -119,6 +120,26 @@ def test_poses_become_runs_with_a_diagnosis(tmp_path: Path, capsys: pytest.Captu
     poses.write_text(head + words("nobody", true_pose(), ","))
     with pytest.raises(InputError, match="no image of a pose is a query"):
         diagnose_poses(poses, [bundled_scenes()[NAME]], None, None, False, None)
+
+
+def test_queries_of_a_scene_without_a_given_pose_are_counted_and_named(
+    tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """hloc lists a query that it could not localize, and gives it no line of results."""
+    world = write_all(make_world(tmp_path, rng), rng)
+    listed = world.folder / "queries.txt"
+    camera = listed.read_text().partition(" ")[2]
+    for k in range(4):
+        (world.folder / "images" / f"lost{k}.jpg").write_bytes(b"")
+    listed.write_text(listed.read_text() + "".join(f"lost{k}.jpg {camera}" for k in range(4)))
+    poses = tmp_path / "results.txt"
+    poses.write_text(words(QUERY, world.truth))
+    diagnose_poses(poses, [world.scene], None, None, False, None)
+    said = capsys.readouterr().err
+    assert "4 queries (lost0.jpg, lost1.jpg, lost2.jpg, ...) of 5 have no pose that is given" in said
+    listed.write_text(f"{QUERY} {camera}")
+    diagnose_poses(poses, [world.scene], None, None, False, None)
+    assert "no pose that is given" not in capsys.readouterr().err
 
 
 def matches_of(name: str, extra: str = "") -> list[str]:

@@ -140,8 +140,8 @@ def _observed(model: ColmapModel, name: str) -> IntArray:
 
 def some(names: Sequence[str], what: str) -> str:
     """Their number, and the names of the first three: "5 images (a, b, c, ...)"."""
-    plural = what if len(names) == 1 else f"{what}s"
-    return f"{len(names)} {plural} ({', '.join(map(shorten, names[:3]))}{', ...' if len(names) > 3 else ''})"
+    plural = what if len(names) == 1 else f"{what[:-1]}ies" if what.endswith("y") else f"{what}s"
+    return f"{len(names):,} {plural} ({', '.join(map(shorten, names[:3]))}{', ...' if len(names) > 3 else ''})"
 
 
 def split_gravity(table: Mapping[str, Any], where: str) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -1,7 +1,7 @@
 """Matches of many queries of another pipeline: one CSV with one camera, hloc's log, or COLMAP's database."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import load_camera
 from spherloc.cameras.principal_point import about_principal_point, about_principal_points
+from spherloc.datasets.colmap import some
 from spherloc.datasets.correspondences import read_csv_of_queries
 from spherloc.datasets.query_gravity import read_gravity_file
 from spherloc.errors import InputError, ProblemError
@@ -40,11 +41,20 @@ class MatchTable:
     """Gravity by the name of the query; None takes it from the poses."""
     gravity_map: FloatArray
     """Unit vector (3,) pointing down in the map."""
+    lost: tuple[str, ...] = ()
+    """Names of the queries that an hloc log lists without a pose."""
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences on what seems to be wrong with the cameras."""
-        return tuple(about_principal_points(self.cameras.items()))
+        """Sentences on queries that are not diagnosed, and on what seems to be wrong with the cameras."""
+        doubts = tuple(about_principal_points(self.cameras.items()))
+        if not self.lost:
+            return doubts
+        missed = (
+            f"{self.path}: hloc found no pose of {some(self.lost, 'query')}, of which nothing is told here; a scene of "
+            "kind hloc localizes them: see spherloc scenes hloc"
+        )
+        return missed, *doubts
 
     def problem(self, name: str, pose: FloatArray | None) -> Problem | InputError:
         """The problem of a query, or what is wrong with it; ``pose`` is its ``cam_from_map`` (3, 4), if it has one."""
@@ -104,7 +114,8 @@ def read_logged_matches(
     matches = {name: (np.hstack([query.pixels, query.points]), None) for name, query in queries.items()}
     cameras = {name: query.camera for name, query in queries.items()}
     wrong = tuple(query for query in told.values() if isinstance(query, InputError))
-    return _table(path, matches, cameras, gravity, gravity_map), wrong
+    lost = tuple(name for name, query in told.items() if query is None)
+    return replace(_table(path, matches, cameras, gravity, gravity_map), lost=lost), wrong
 
 
 def read_database_matches(

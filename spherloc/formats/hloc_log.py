@@ -50,26 +50,27 @@ def is_log(path: Path) -> bool:
 def read_log_poses(path: Path) -> dict[str, FloatArray]:
     """Poses ``cam_from_map`` (3, 4) of the queries that were localized. Raises ``InputError`` for another file."""
     poses = {}
-    for name, entry, place in _localized(path):
-        with _placed(place):
-            poses[name] = _pose(entry, place)
+    for name, entry, place in _entries(path):
+        if entry is not None:
+            with _placed(place):
+                poses[name] = _pose(entry, place)
     return poses
 
 
 def read_log(
     path: Path, model: ColmapModel | None, camera: Camera | None = None
-) -> dict[str, LoggedQuery | InputError]:
-    """Pose and matches of each query that was localized, or why they cannot be used.
+) -> dict[str, LoggedQuery | InputError | None]:
+    """Pose and matches of each query, or why they cannot be used; None for one that was not localized.
 
     ``model`` is the COLMAP model of the map, which newer logs need, since they have only the ids of points. A query of
     which the log states no camera has that of the model's image of its name; if there is none, ``camera``. Raises
     ``InputError`` for another file.
     """
-    found: dict[str, LoggedQuery | InputError] = {}
-    for name, entry, place in _localized(path):
+    found: dict[str, LoggedQuery | InputError | None] = {}
+    for name, entry, place in _entries(path):
         try:
             with _placed(place):
-                found[name] = _query(name, entry, model, camera, place)
+                found[name] = None if entry is None else _query(name, entry, model, camera, place)
         except InputError as error:
             found[name] = error
     return found
@@ -84,8 +85,11 @@ def _placed(place: str) -> Iterator[None]:
         raise InputError(f"{place}: {error}; give the log as hloc wrote it.") from error
 
 
-def _localized(path: Path) -> Iterator[tuple[str, Mapping[str, Any], str]]:
-    """Name, entry and place of each query that has a pose; of several clusters of references, the best one's entry."""
+def _entries(path: Path) -> Iterator[tuple[str, Mapping[str, Any] | None, str]]:
+    """Name, entry and place of each query; of several clusters of references, the best one's entry.
+
+    The entry is None where the query has no pose.
+    """
     with reading(path, "give hloc's log"):
         content = read_file(path, MAX_BYTES)
     try:
@@ -104,8 +108,9 @@ def _localized(path: Path) -> Iterator[tuple[str, Mapping[str, Any], str]]:
                 best = value_of(entry.get("best_cluster"))
             entry = _table(clusters[best]) if isinstance(best, int) and 0 <= best < len(clusters) else {}
         result = _table(entry.get("PnP_ret"))
-        if isinstance(name, str) and ("cam_from_world" in result or (result.get("success") and "qvec" in result)):
-            yield name, entry, place
+        if isinstance(name, str):
+            posed = "cam_from_world" in result or (result.get("success") and "qvec" in result)
+            yield name, entry if posed else None, place
 
 
 def _table(found: Any) -> Mapping[str, Any]:

@@ -1,10 +1,12 @@
 """``spherloc diagnose``: poses that another program found become recorded runs with a diagnosis."""
 
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from spherloc.datasets import load_scene
+from spherloc.datasets.colmap import some
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.match_table import MatchTable
 from spherloc.datasets.variation import used_seed
@@ -46,7 +48,7 @@ def diagnose_poses(
     """
     given = read_poses(poses)
     if not given:
-        raise InputError(f"{poses}: has no pose.")
+        raise InputError(f"{poses}: has no pose; give the results of a program that localized some of the images.")
     code, used = 0, set[str]()
     with store_of(records) as store:
         for scene in scenes:
@@ -106,6 +108,11 @@ def _problems(
     views = [view for view in scene.queries if view.name in given]
     if views:
         _say_all(scene.remarks)
+        if lost := [view.name for view in scene.queries if view.name not in given]:
+            say(
+                f"{path}: {some(lost, 'query')} of {len(scene.queries):,} have no pose that is given, so nothing is "
+                f"told of them; localize them with: spherloc localize {shlex.quote(str(path))}"
+            )
         prepare(scene)
     with progress(len(views), "queries") as advance:
         for view in views:
