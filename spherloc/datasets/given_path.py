@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from spherloc.datasets.asl_layout import AslSequence, asl_sequence
+from spherloc.datasets.loc360_layout import is_hall
 from spherloc.errors import InputError, shorten
 from spherloc.files import IMAGES, is_file, is_folder, is_image, names_in, read_file
 
@@ -111,6 +112,8 @@ def _folder(path: Path) -> tuple[str, str]:
         return "a COLMAP model", _COLMAP
     if "sensors" in names:
         return "a dataset of kapture", "a scene of kind kapture localizes its images: see spherloc scenes kapture"
+    if is_hall(path):
+        return "a hall of 360Loc", "a scene of kind 360loc localizes its images: see spherloc scenes 360loc"
     if "results.jsonl" in names:
         runs = _quoted(path / "recordings")
         return "a folder of results of spherloc localize", f"list its runs with: spherloc runs {runs}"

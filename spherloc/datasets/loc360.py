@@ -21,6 +21,7 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.datasets import map_scene, scene_file
 from spherloc.datasets.colmap import gravity_of_map, some, split_gravity
 from spherloc.datasets.image_folder import read_pose
+from spherloc.datasets.loc360_layout import IMAGES, MAPPING, POSES
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import InputError, show
 from spherloc.files import is_file, is_folder, names_in, read_file, reading
@@ -47,7 +48,6 @@ bound_deg = 5.0                                   # how far a query's roll and p
 THRESHOLDS = ((2.0, 0.25), (5.0, 0.5), (10.0, 5.0))
 """The dataset's own limits (degrees, metres)."""
 GRAVITY_BOUND_DEG = 5.0
-POSES, IMAGES = "camera_pose.json", "image"
 _MAX_BYTES = 1 << 26
 _MAX_STEPS = 100_000
 
@@ -65,8 +65,8 @@ def load(table: dict[str, Any], path: Path) -> MapScene:
     scene_file.check_keys(gravity, set(), {"map"}, f"{where} [gravity]")
     settings = map_scene.read_settings(table | {"gravity": shared_gravity}, where, GRAVITY_BOUND_DEG, THRESHOLDS)
     root = map_scene.folder(table, "root", path)
-    queries, skipped = _views(root, {"mapping": ["mapping"]} | table, "queries", "query_step", where)
-    mapped, missing = _views(root, {"mapping": ["mapping"]} | table, "mapping", "reference_step", where)
+    queries, skipped = _views(root, {"mapping": [MAPPING]} | table, "queries", "query_step", where)
+    mapped, missing = _views(root, {"mapping": [MAPPING]} | table, "mapping", "reference_step", where)
     references = with_triangulation(mapped, frontend_options(settings.frontend, where, path.parent))
     down, assumed = gravity_of_map(gravity, references, where)
     return settings.scene(path, queries, references, down, (*skipped, *missing, *assumed), assumed_down=bool(assumed))

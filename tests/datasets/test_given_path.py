@@ -26,6 +26,11 @@ def filled(folder, *names):
         (["1.png"], "is a folder of 1 image; a map takes two images or more: add some to it"),
         (["cameras.bin", "images.bin", "points3D.bin", "frames.bin"], "is a COLMAP model; a scene of kind colmap"),
         (["sensors/sensors.txt"], "is a dataset of kapture"),
+        (
+            ["mapping/daytime_360_0/camera_pose.json", *(f"mapping/daytime_360_0/image/{k}.jpg" for k in range(3))],
+            "is a hall of 360Loc; a scene of kind 360loc localizes its images: see spherloc scenes 360loc",
+        ),
+        (["mapping/1.jpg", "mapping/2.jpg"], "is a folder without images, but with 2 in the folders in it; make a map"),
         (["results.jsonl", "trajectory.png"], "is a folder of results of spherloc localize; list its runs with"),
         (["a.rrd", "b.rrd"], "is a folder of 2 recordings; list them with: spherloc runs "),
         (["a.toml"], "is a folder of 1 scene file; give one of them, such as "),
