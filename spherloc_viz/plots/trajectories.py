@@ -239,6 +239,9 @@ def _named(axes: Axes, results: SequenceResults, places: FloatArray, true_places
 
 
 SEVERAL_COLORS = ("#1b6ca8", "#c77d0a", "#7b2d8b", "#3a8a3a", "#b02a30", "#5fb3e6", "#8c6d31", "#555555")
+ANY_COLOR = "0.25"
+"""In the legend, the colour of what is drawn in each estimator's."""
+DASHES = (0, (4, 3))
 LARGEST_MARKER = 10.0
 MAX_LOST_NAMED = 6
 """Largest number of failures of an estimator whose names are written into the picture."""
@@ -248,16 +251,22 @@ MAX_LOST_NAMED = 6
 def trajectories_png(several: Sequence[tuple[str, SequenceResults]], backdrop: Backdrop) -> bytes:
     """PNG of one sequence as several estimators localized it: positions and directions of view by colour over the map.
 
-    ``several`` are labels with results of the same scene. A query whose pose is outside the picture or missing is a
-    cross at its true position, named if there are few; a wrong position is joined to the true one. Positions are joined
-    only where the queries follow each other in time. The same results give the same bytes.
+    ``several`` are labels with results of the same scene, not all of which need have every query. A query whose pose is
+    outside the picture or missing is a cross at its true position, named if there are few; a wrong position is joined
+    to the true one. Positions are joined only where the queries follow each other in time. The same results give the
+    same bytes.
     """
-    first = several[0][1]
+    first = max((results for _, results in several), key=lambda results: len(results.rows))
     true_places = _from_above(first, first.true_positions_m)
     places = [_from_above(results, results.positions_m) for _, results in several]
     everywhere = np.concatenate(places)
-    below = 0.25 * ((len(several) + 4) // 2)
-    framed = np.concatenate([_true_if_known(seen, true_places) for seen in places])
+    below = 0.25 * ((len(several) + 6) // 2)
+    framed = np.concatenate(
+        [
+            _true_if_known(seen, _from_above(results, results.true_positions_m))
+            for (_, results), seen in zip(several, places, strict=True)
+        ]
+    )
     figure, panels = _panels(first, _frames(first, around(framed), backdrop), 1.3 + below)
     for axes in panels:
         _map(axes, first, backdrop)
@@ -273,6 +282,7 @@ def trajectories_png(several: Sequence[tuple[str, SequenceResults]], backdrop: B
             LARGEST_MARKER - (LARGEST_MARKER - 3.0) * number / max(1, len(several) - 1),
         )
         labels += _one_of_several(axes, label, results, seen, style)
+    _legend_of_failures(axes, [results for _, results in several], places)
     _title(figure, first.configuration.name)
     _legend(figure, axes)
     write_labels(axes, labels, everywhere[np.isfinite(everywhere).all(axis=1)])
@@ -319,15 +329,41 @@ def _one_of_several(
         headlength=0.0,
         headaxislength=0.0,
     )
-    wrong = inside & with_truth & (errors_m > limit_m)
+    wrong = _wrong(results, inside, true_places)
     for start, end in zip(true_places[wrong], seen[wrong], strict=True):
-        axes.plot(*np.stack([start, end]).T, color=color, linewidth=0.7, linestyle=(0, (4, 3)))
+        axes.plot(*np.stack([start, end]).T, color=color, linewidth=0.7, linestyle=DASHES)
     lost = ~inside & with_truth
     if lost.any():
         axes.plot(*true_places[lost].T, "x", color=color, markersize=8.0, markeredgewidth=1.4)
     if np.count_nonzero(lost) > MAX_LOST_NAMED:
         return []
     return [PlaceName((results.rows[place].query,), true_places[place], color) for place in np.flatnonzero(lost)]
+
+
+def _wrong(results: SequenceResults, inside: BoolArray, true_places: FloatArray) -> BoolArray:
+    """(Q,) which of the positions ``inside`` the picture are too far from the true ones."""
+    errors_m, _, limit_m = _errors(results)
+    return inside & np.isfinite(true_places).all(axis=1) & (errors_m > limit_m)
+
+
+def _legend_of_failures(axes: Axes, several: Sequence[SequenceResults], places: Sequence[FloatArray]) -> None:
+    """Put into the legend what dashed lines and crosses are, whatever their colour, if there are some.
+
+    ``places`` are the positions (Q, 2) of each estimator's results, seen from above.
+    """
+    wrong = lost = 0
+    for results, seen in zip(several, places, strict=True):
+        true_places = _from_above(results, results.true_positions_m)
+        inside = np.isfinite(seen).all(axis=1) & _inside(axes, seen)
+        wrong += np.count_nonzero(_wrong(results, inside, true_places))
+        lost += np.count_nonzero(~inside & np.isfinite(true_places).all(axis=1))
+    if wrong:
+        limit = f"{_errors(several[0])[2]:g} {several[0].configuration.unit}"
+        words = f"error beyond {limit}, to the true position"
+        axes.plot([], [], color=ANY_COLOR, linewidth=0.9, linestyle=DASHES, label=words)
+    if lost:
+        words = "without a pose, or with one outside the picture"
+        axes.plot([], [], "x", color=ANY_COLOR, markersize=8.0, markeredgewidth=1.4, label=words)
 
 
 def _headings(results: SequenceResults) -> FloatArray:

@@ -138,6 +138,34 @@ def test_the_picture_of_several_estimators_has_the_map(figure_of):
     assert any(text.get_text() == "lost.png" for text in figure.axes[-1].texts)
 
 
+def test_the_legend_of_several_estimators_tells_lines_and_crosses(figure_of):
+    true = [pose(FACING_X, -FACING_X @ [x, 3.0, 1.5]) for x in (-2.0, 0.0, 2.0)]
+    near = query(0, "a.png", -2.0, 3.05, truth_cam_from_map=true[0], translation_error_m=0.05, rotation_error_deg=0.1)
+    off = query(1, "b.png", -1.0, 3.0, truth_cam_from_map=true[1], translation_error_m=1.0, rotation_error_deg=0.1)
+    lost = without_pose(2, "c.png", truth_cam_from_map=true[2])
+    dashes, cross = "error beyond 0.5 m, to the true position", "without a pose, or with one outside the picture"
+    for rows, said in (
+        ((near,), set()),
+        ((near, off), {dashes}),
+        ((near, lost), {cross}),
+        ((off, lost), {dashes, cross}),
+    ):
+        several = [("mc", results(near, near, near)), ("other", results(*rows))]
+        legend = legend_of(figure_of(trajectories_png, several, ROOM))
+        assert {dashes, cross} & set(legend) == said
+        assert len(legend) == len(set(legend))
+
+
+def test_results_of_some_queries_are_drawn_beside_those_of_all(figure_of):
+    """An estimator may have localized more queries before, of which the picture shows all."""
+    rows = [query(k, f"{k}.png", 2.0 * k - 4.0, 1.0) for k in range(5)]
+    rows = [replace(row, truth_cam_from_map=row.cam_from_map, translation_error_m=0.0) for row in rows]
+    for several in ((results(*rows), results(*rows[:2])), (results(*rows[:2]), results(*rows))):
+        (axes,) = figure_of(trajectories_png, [(str(k), found) for k, found in enumerate(several)], ROOM).axes
+        (truth,) = [line for line in axes.lines if line.get_label() == "truth"]
+        assert len(truth.get_xdata()) == 5
+
+
 def test_several_estimators_are_compared_by_errors_where_there_is_truth_else_by_what_is_localized(figure_of):
     posed, doubted = query(0, "a.png", -2.0, -2.0), replace(query(1, "b.png", 2.0, 1.0), status="doubtful")
     legend = legend_of(figure_of(trajectories_png, [("mc", results(posed, doubted)), ("other", results(posed))], ROOM))
