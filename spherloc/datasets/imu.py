@@ -67,10 +67,14 @@ def read_imu(path: Path) -> ImuSamples:
     Raises ``InputError``, one sentence with the file and the line, for any other file.
     """
     times, numbers = array("q"), array("d")
-    for place, text in rows(path, f"lines of {_COLUMNS}"):
+    lines = rows(path, f"lines of {_COLUMNS}")
+    for place, text in lines:
         words = [word.strip() for word in text.split(",")]
         if len(words) not in (7, 9):
-            raise InputError(f"{place}: has {len(words)} columns; give {_COLUMNS}.")
+            if times and len(words) < 9 and next(lines, None) is None:
+                raise InputError(f"{place}: is the last line and cut off; remove it, or copy the log again.")
+            columns = f"{len(words)} column{'' if len(words) == 1 else 's'}"
+            raise InputError(f"{place}: has {columns}, separated by commas; give {_COLUMNS}.")
         time_ns = _time_ns(words[:-6], place)
         measured = finite_numbers(words[-6:], place)
         if times and time_ns <= times[-1]:
@@ -83,6 +87,11 @@ def read_imu(path: Path) -> ImuSamples:
         raise InputError(f"{path}: holds no measurement; give lines of {_COLUMNS}.")
     table = np.frombuffer(numbers, dtype=np.float64).reshape(-1, 6)
     typical = float(np.median(np.linalg.norm(table[:, 3:], axis=1)))
+    if not typical:
+        raise InputError(
+            f"{path}: its accelerations are 0, and a gyroscope alone cannot tell where down is; give a log with those "
+            "of the accelerometer."
+        )
     if not 0.8 * GRAVITY_M_S2 <= typical <= 1.25 * GRAVITY_M_S2:
         raise InputError(
             f"{path}: the accelerometer's median is {typical:.3g}, not the {GRAVITY_M_S2} m/s^2 of gravity; "
@@ -95,7 +104,9 @@ def _time_ns(words: Sequence[str], place: str) -> int:
     """Time of a row, ns, from its columns ``timestamp_ns`` or ``counter,sec,nsec``."""
     if len(words) == 1:
         if not (words[0].isdecimal() and words[0].isascii() and len(words[0]) < 20):
-            raise InputError(f"{place}: {show(words[0])} is not a time in nanoseconds; check the order of the columns.")
+            raise InputError(
+                f"{place}: {show(words[0])} is not a time in whole nanoseconds; convert it, or check the columns."
+            )
         return int(words[0])
     _, sec, nsec = finite_numbers(words, place)
     if not (0 <= sec <= _LARGEST_S and 0 <= nsec < NS_PER_S and sec == int(sec) and nsec == int(nsec)):
@@ -149,6 +160,29 @@ def down_at(samples: ImuSamples, timestamps_ns: NDArray[np.int64]) -> FloatArray
             asked_s = (timestamps_ns[asked] - first_ns) / NS_PER_S
             down[asked] = _down(times_s, samples.rates_rad_s[piece], samples.forces_m_s2[piece], asked_s)
     return down
+
+
+def why_unknown(samples: ImuSamples, time_ns: int | None) -> str:
+    """Why ``down_at`` gives nothing at a time, with what to do: "its time, 12.0 s, is outside of the log, ...".
+
+    ``time_ns`` is None for an image without a time.
+    """
+    if time_ns is None:
+        return f"it has no time, which its name may tell: {NAME_RULE}"
+    first_ns, last_ns = samples.timestamps_ns[0], samples.timestamps_ns[-1]
+    if not first_ns <= time_ns <= last_ns:
+        return (
+            f"its time, {_seconds(time_ns)} s, is outside of the log, from {_seconds(first_ns)} to {_seconds(last_ns)} "
+            "s; give times on the clock of the log"
+        )
+    return (
+        f"at its time, {_seconds(time_ns)} s, the log has less than {MIN_S:g} s of measurements without a gap; give a "
+        "log without gaps"
+    )
+
+
+def _seconds(time_ns: int | np.int64) -> str:
+    return f"{int(time_ns) / NS_PER_S:.3f}"
 
 
 def _down(times_s: FloatArray, rates_rad_s: FloatArray, forces_m_s2: FloatArray, asked_s: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from spherloc.datasets import scene_file
-from spherloc.datasets.imu import MIN_S, NAME_RULE, ImuSamples, down_at, read_imu, time_in_name
+from spherloc.datasets.imu import ImuSamples, down_at, read_imu, time_in_name, why_unknown
 from spherloc.errors import InputError, shorten, show
 from spherloc.formats.text_rows import finite_numbers, rows
 from spherloc.frontend.view import Gravity, View
@@ -119,12 +119,11 @@ class GravitySettings:
                 f"{shorten(without[0])}."
             )
         if self.imu is not None:
-            lost = [view.name for view in queries if view.gravity is None]
+            lost = [view for view in queries if view.gravity is None]
             if lost:
                 remarks.append(
                     f"{len(lost)} of {len(queries)} queries have no gravity from {self.imu.file}, the first is "
-                    f"{shorten(lost[0])}: no time ({NAME_RULE}), or one in a gap or outside of the log, which needs "
-                    f"{MIN_S:g} s without a gap."
+                    f"{shorten(lost[0].name)}: {why_unknown(self.imu.samples, time_of(lost[0]))}."
                 )
         if self.query == "truth":
             unknown = sum(view.cam_from_map is None for view in queries)
@@ -200,7 +199,8 @@ def read_gravity_file(path: Path) -> dict[str, Gravity]:
         if number == 0 and _TITLES.fullmatch(" ".join(words).replace('"', "").lower()):
             continue
         if match is None or len(words) not in (3, 4):
-            raise InputError(f"{place}: is not a row {_COLUMNS}; give a name and three or four numbers.")
+            log = "; the log of an IMU needs camera_from_imu" if text.count(",") in (6, 8) else ""
+            raise InputError(f"{place}: is not a row {_COLUMNS}; give a name and three or four numbers{log}.")
         name = match[1] or match[2]
         x, y, z, *sd_deg = finite_numbers(words, place)
         length = float(np.linalg.norm([x, y, z]))

@@ -93,7 +93,7 @@ def test_an_imu_file_as_euroc_has_it(folder):
     samples = read_imu(write(folder, f"#timestamp [ns],w_RS_S_x [rad s^-1]\n{rows}", "imu.csv"))
     assert samples.timestamps_ns.tolist() == [10**18, 10**18 + 5, 10**18 + 10]
     np.testing.assert_array_equal(samples.forces_m_s2[2], [9.7, 0, 2])
-    with pytest.raises(InputError, match=r"line 1: '1.5' is not a time in nanoseconds"):
+    with pytest.raises(InputError, match=r"line 1: '1.5' is not a time in whole nanoseconds"):
         read_imu(write(folder, "1.5,0,0,0,9.8,0,0\n", "wrong.csv"))
 
 
@@ -110,7 +110,10 @@ def test_an_imu_file_as_euroc_has_it(folder):
         (IMU.replace("0.5", "nan", 1), "line 2"),
         (IMU.replace("0.5", "0.5,1", 1), "line 2"),
         (IMU.replace("0.5", "5e4", 1), "line 2"),
-        (IMU.replace(",", " "), "columns"),
+        (IMU.replace(",", " "), "has 1 column, separated by commas"),
+        (IMU.rstrip().rpartition(",")[0], "line 5: is the last line and cut off; remove it"),
+        (f"{10**18},0.1,0,0,0,0,0\n{10**18 + 5},0.1,0,0,0,0,0\n", "a gyroscope alone cannot tell where down is"),
+        (IMU.replace(",9.7", ""), "line 2: has 8 columns, separated by commas"),
     ],
 )
 def test_wrong_imu_file_is_one_sentence(folder, text, says):

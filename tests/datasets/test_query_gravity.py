@@ -60,6 +60,8 @@ def test_the_first_row_of_a_gravity_file_may_have_titles(tmp_path, titles):
         ("a.jpg,0,1,0\nimage,gx,gy,gz\n", "line 2: 'gx' is not a finite number"),
         ("a.jpg 0 1\n", "line 1: is not a row image gx gy gz"),
         ("# c\na.jpg 0 1 0 1 1\n", "line 2: is not a row image gx gy gz"),
+        ("#timestamp,wx,wy,wz,ax,ay,az\n1,0,0,0,0,9,0\n", "line 2: is not a row image gx gy gz [sd_deg]; give a name"),
+        ("1,0,0,0,0,9,0\n", "three or four numbers; the log of an IMU needs camera_from_imu."),
         ("a.jpg 0 one 0\n", "line 1: 'one' is not a finite number"),
         ("a.jpg 0 nan 0\n", "line 1: 'nan' is not a finite number"),
         ("a.jpg 0 0 0\n", "line 1: its vector has the length 0;"),
@@ -108,6 +110,14 @@ def test_a_log_of_an_imu_gives_queries_gravity_by_the_times_in_their_names(tmp_p
     assert inside.gravity is not None and inside.gravity.source == "the IMU" and inside.gravity.bound_rad is None
     np.testing.assert_allclose(inside.gravity.down, [0, 1, 0], atol=1e-12)
     assert after.gravity is None and "1 of 2 queries have no gravity from" in remarks[0]
+    said = "its time, 1000000010.000 s, is outside of the log, from 1000000000.000 to 1000000002.990 s; give times on"
+    assert said in remarks[0]
+    _, (remark,) = settings.of_queries([View("a.png", Equirectangular(64, 32), tmp_path / "q.png")], DOWN)
+    assert "the first is a.png: it has no time, which its name may tell: names like 1625133000_" in remark
+    (tmp_path / "imu.csv").write_text("".join(rows.splitlines(keepends=True)[:50]))
+    settings = read_gravity({"imu": "imu.csv", "camera_from_imu": turn}, str(tmp_path / "s.toml"), 3.0)
+    _, (remark,) = settings.of_queries([replace(views[0], name=f"{10**18 + 10**8}.png")], DOWN)
+    assert "at its time, 1000000000.100 s, the log has less than 1 s of measurements without a gap" in remark
     for table, said in (
         ({"imu": "imu.csv"}, "key 'camera_from_imu' is missing"),
         ({"imu": "imu.csv", "camera_from_imu": [[1, 0, 0]] * 3}, "is not a rotation"),

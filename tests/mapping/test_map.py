@@ -247,7 +247,7 @@ def test_the_log_of_an_imu_levels_a_map(walk, tmp_path):
     lines = tomllib.loads("\n".join(_gravity(level, stated, tmp_path)))["gravity"]
     settings = read_gravity({key: value for key, value in lines.items() if key != "map"}, str(tmp_path / "s.toml"), 2.0)
     assert settings.imu is not None and np.array_equal(settings.imu.camera_from_imu, turn)
-    with pytest.raises(InputError, match="each needs a time in its name"):
+    with pytest.raises(InputError, match=r"the first is .*: it has no time, which its name may tell"):
         read_stated_gravity(tmp_path / "imu.csv", turn, found.views)
     several = [replace(views[0], camera=Equirectangular(400, 200)), *views[1:]]
     with pytest.raises(InputError, match="are of 2 cameras, each of which is turned otherwise to the IMU"):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from spherloc.datasets.imu import MIN_S, NAME_RULE, read_imu
-from spherloc.datasets.query_gravity import ImuLog, read_gravity_file
+from spherloc.datasets.imu import read_imu, why_unknown
+from spherloc.datasets.query_gravity import ImuLog, read_gravity_file, time_of
 from spherloc.errors import InputError, shorten, show
 from spherloc.frontend.view import Gravity, View
 from spherloc.mapping.images.photographs import cameras_of
@@ -68,7 +68,7 @@ def read_stated_gravity(file: Path, camera_from_imu: FloatArray | None, views: S
         log = ImuLog(file, read_imu(file), camera_from_imu)
         timed = log.with_gravity(tuple(replace(view, gravity=None) for view in views))
         found = {view.name: view.gravity for view in timed if view.gravity is not None}
-        rule = f"each needs a time in its name ({NAME_RULE}), within {MIN_S:g} s or more of the log without a gap"
+        rule = f"the first is {shorten(views[0].name)}: {why_unknown(log.samples, time_of(views[0]))}" if views else ""
     without = [view.name for view in views if view.name not in found]
     if not found:
         raise InputError(f"{file}: has gravity of none of the {len(views)} photographs; {rule}.")
