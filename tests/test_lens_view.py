@@ -1,14 +1,19 @@
 """The map through a query's lens: what is seen where, what hides what, and the strip of queries."""
 
+import re
+from types import SimpleNamespace
+from typing import Any
+
 import cv2
 import numpy as np
+from waiting import until
 
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.experiments.results import QueryResult
 from spherloc.frontend.view import View
 from spherloc.geometry import pose
-from spherloc_viz.app.controls.query_strip import ORDERS, Strip, end_of, ordered, strip_html, thumbnail
+from spherloc_viz.app.controls.query_strip import ORDERS, QueryStrip, Strip, end_of, ordered, strip_html, thumbnail
 from spherloc_viz.layers.lens_view import through_lens
 
 LENS = KannalaBrandt(320, 320, 110.0, 110.0, 160.0, 160.0, (0.0, 0.0, 0.0, 0.0))
@@ -96,3 +101,28 @@ def test_the_strip_is_sorted_turned_and_told(tmp_path):
     assert thumbnail(queries[0]) == ""
     cv2.imwrite(str(queries[0].path), np.full((320, 320, 3), 90, np.uint8))
     assert thumbnail(queries[0]).startswith("data:image/jpeg;base64,")
+
+
+def test_the_strip_turns_to_the_query_that_the_page_shows(tmp_path):
+    """At first, and if another one is shown; else it stays where it was turned to, also while results come in."""
+    presses: dict[str, Any] = {}
+    shown: list[str] = []
+    strip = QueryStrip(SimpleNamespace(on=presses.__setitem__), shown.append, print, print)  # pyright: ignore[reportArgumentType]
+    queries = [View(f"q{number:02d}", LENS, tmp_path / f"{number}.png") for number in range(60)]
+    scene: Any = SimpleNamespace(queries=queries, metric=True)
+
+    def expect(page: int, marks: int) -> None:
+        until(lambda: shown and f"page {page} of 3" in shown[-1] and shown[-1].count("3px solid") == marks)
+        assert len(re.findall("strip-open:", shown[-1])) == (12 if page == 3 else 24)
+
+    strip.set(scene, (), False, "q40")
+    expect(2, 0)
+    presses["strip-page"](SimpleNamespace(argument="0"))
+    expect(1, 0)
+    strip.set(scene, (QueryResult(0, "q00", "failed"),), False, "q40")
+    expect(1, 1)
+    strip.set(scene, (QueryResult(0, "q00", "failed"),), False, "q59")
+    expect(3, 0)
+    presses["strip-order"](SimpleNamespace(argument="outcome"))
+    expect(1, 1)
+    strip.close()

@@ -67,7 +67,9 @@ def sequence_text(results: SequenceResults, summary: Summary, scene: MapScene) -
         for line in (*_skipped(summary), *_each(results, scene), *_without_pose(results.rows), *_remarks(results.rows))
     ]
     if not timed(results):
-        lines.append("  trajectory: times are places in the sequence, as those of the queries do not always grow")
+        none = any(row.timestamp_s is None for row in results.rows)
+        why = "not all queries have a time" if none else "those of the queries do not always grow"
+        lines.append(f"  trajectory: times are places in the sequence, as {why}")
     if (picture := results.folder / PICTURE).exists():
         lines.append(f"  picture: {picture}")
     return "\n".join([*lines, f"  written to {results.folder}"])

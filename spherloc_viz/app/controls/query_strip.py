@@ -61,7 +61,9 @@ class QueryStrip:
         self._lock = threading.Lock()
         self._scene: MapScene | None = None
         self._rows: Mapping[str, QueryResult] = {}
-        self._order, self._page, self._hidden, self._marked = "order", 0, False, ""
+        self._order, self._hidden, self._marked = "order", False, ""
+        self._page: int | None = None
+        """Page at hand; None for that of the marked query."""
         self._pictures: OrderedDict[Path, str] = OrderedDict()
         self._worker = BackgroundWorker("spherloc-strip", failed)
         touches.on("strip-order", self._sort)
@@ -74,10 +76,10 @@ class QueryStrip:
 
     def set(self, scene: MapScene | None, rows: Sequence[QueryResult], hidden: bool, marked: str) -> None:
         """Show the queries of a scene and what became of them by now; ``hidden`` tells no answers, ``marked`` is the
-        name of the query that the page shows."""
+        name of the query that the page shows, to which the strip turns if it is another one."""
         with self._lock:
-            if scene is not self._scene:
-                self._page = 0
+            if scene is not self._scene or marked != self._marked:
+                self._page = None
             self._scene, self._hidden, self._marked = scene, hidden, marked
             self._rows = {row.query: row for row in rows}
         self._worker.ask(self._draw)
@@ -109,6 +111,11 @@ class QueryStrip:
             return
         known = {} if hidden else rows
         views = ordered(scene.queries, known, order)
+        if page is None:
+            page = next((place for place, view in enumerate(views) if view.name == marked), 0) // PAGE
+            with self._lock:
+                if self._page is None and self._scene is scene and self._marked == marked:
+                    self._page = page
         page = min(page, (len(views) - 1) // PAGE)
         shown = views[page * PAGE : (page + 1) * PAGE]
         pictures = {view.name: self._picture(view) for view in shown}
