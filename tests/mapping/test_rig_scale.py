@@ -126,6 +126,30 @@ def test_cameras_that_the_map_has_turned_are_shifted_too(rng):
     assert rms < 0.005 and 0.3 * rms < np.mean(told) < 3.0 * rms, (rms, np.mean(told))
 
 
+def test_two_cameras_that_the_mapper_had_fixed_are_one_measurement(rng):
+    """Turned and shifted by the same at all times: a lever fits that, whatever the scale is along the turn's axis."""
+    errors, told = [], []
+    for _ in range(60):
+        rig = Rig(rng)
+        apart_m = np.linalg.norm(rig.bodies["b"][:3, 3] - rig.bodies["a"][:3, 3])
+        if apart_m < 0.05:
+            continue
+        turn = 0.004 * apart_m * rng.normal(size=3)
+        shift_m = np.cross(turn, [1.0, 0.5, 2.5]) + 0.003 * apart_m * rng.normal(size=3)
+        for time in range(12):
+            del rig.poses[f"c{time}"]
+            one = rig.poses[f"b{time}"]
+            body_from_map = rig.bodies["b"][:3, :3] @ one[:, :3]
+            rotation = rig.bodies["b"][:3, :3].T @ Rotation.from_rotvec(turn).as_matrix() @ body_from_map
+            centre = camera_centre(one) + body_from_map.T @ shift_m / METRES_PER_UNIT
+            rig.poses[f"b{time}"] = pose(rotation, -rotation @ centre)
+        scale = rig.scale
+        errors.append(scale.metres_per_unit / METRES_PER_UNIT - 1.0)
+        told.append(float(scale.source.rpartition("good to ")[2].rstrip("%")) / 100.0)
+    rms = float(np.sqrt(np.mean(np.square(errors))))
+    assert rms < 0.05 and 0.3 * rms < np.mean(told) < 3.0 * rms, (rms, np.mean(told))
+
+
 def test_its_uncertainty_is_also_that_of_what_is_off_at_all_times(rng):
     """A calibration that has the cameras some millimetres beside where they are, or a map that does."""
     errors, told = [], []

@@ -71,11 +71,15 @@ def scale_by_rig(poses: Mapping[str, FloatArray], fixed: FixedImages) -> MapScal
     if 2 * np.count_nonzero(alike) < len(alike):
         raise InputError(_otherwise(none, turned_rad))
     stated, mapped, turns = stated[alike], mapped[alike], turns[alike]
-    units, scattered, steady = _units_per_metre(stated, mapped, turns if len(times) >= MIN_FOR_LEVER else None)
+    same = _always_the_same(stated, mapped)
+    # Two cameras that the mapper had fixed are one measurement of three numbers: a lever would fit two of them, and
+    # leave the scale to the part of their distance along the axis of the turn, which may be nearly nothing.
+    levered = len(times) >= MIN_FOR_LEVER and not (same and len(np.unique(stated, axis=0)) == 1)
+    units, scattered, steady = _units_per_metre(stated, mapped, turns if levered else None)
     # Of three images that were taken together the third distance tells nothing new, and few times tell little.
     free = sum(len(names) - 1 for names in times)
     relative = float(np.sqrt(len(pairs) / free)) * max(scattered * (1.0 + 5.0 / (len(times) - 1)), steady)
-    if _always_the_same(stated, mapped):
+    if same:
         relative *= OFF_IF_FIXED
     apart = _range_m(np.linalg.norm(stated, axis=1))
     seen = f"images that cameras {apart} apart took together, at {len(times)} times"
