@@ -1,6 +1,7 @@
 """Picture of a map from above: its points and images, with the names for which there is room."""
 
 from collections.abc import Mapping
+from itertools import groupby
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -24,8 +25,8 @@ def map_above(points: FloatArray, centres: Mapping[str, FloatArray], joined: boo
     """PNG of a map from above, and the number of images whose names are not written there, for lack of room.
 
     ``points`` are (P, 3), ``centres`` those of the images (3,) by name, with z up, in ``unit``; with ``joined`` a line
-    joins the images in the order of their names. Points far from the images are cut. If the images lie in a small part
-    of the picture, a second one shows them alone.
+    joins the images of each folder in the order of their names. Points far from the images are cut. If the images lie
+    in a small part of the picture, a second one shows them alone.
     """
     places = np.stack([centre[:2] for centre in centres.values()])
     frames = frames_of(with_room(places, points[:, :2]), around(places))
@@ -46,12 +47,18 @@ def map_above(points: FloatArray, centres: Mapping[str, FloatArray], joined: boo
     if len(panels) > 1:
         panels[-1].set_title("the cameras alone")
     if joined:
-        walk = np.stack([centres[name][:2] for name in sorted(centres)])
-        panels[-1].plot(*walk.T, color="#d08a1c", linewidth=0.8)
+        for _, names in groupby(sorted(centres, key=lambda name: (folder_of(name), name)), folder_of):
+            walk = np.stack([centres[name][:2] for name in names])
+            panels[-1].plot(*walk.T, color="#d08a1c", linewidth=0.8)
     labels = names_at(places, list(centres))
     without = set(write_labels(panels[-1], labels, places, beside=True))
     named = sum(min(len(label.lines), MAX_LINES) for label in labels if label not in without)
     return png_of(figure), len(centres) - named
+
+
+def folder_of(name: str) -> str:
+    """The folder in an image's name: fixed cameras with the same lens have one each."""
+    return name.rpartition("/")[0]
 
 
 def names_at(places: FloatArray, names: list[str]) -> list[PlaceName]:

@@ -69,3 +69,12 @@ def test_names_of_images_at_one_place_stand_under_each_other() -> None:
     assert [label.lines for label in names_at(places, list("abcd"))] == [("a", "c"), ("b",), ("d",)]
     (label,) = names_at(np.zeros((6, 2)), list("abcdef"))
     assert label.lines == ("a", "b", "c", "d", "and 2 more")
+
+
+def test_a_line_joins_the_images_of_each_folder(drawn, rng) -> None:
+    """Those of another camera do not follow the last one of the first."""
+    centres = {f"cam{k % 2}/{k}.png": np.array([float(k), float(k % 2), 1.5]) for k in range(6)}
+    map_above(around(rng), centres, True, "metres")
+    assert [line.get_xdata().tolist() for line in drawn[0].axes[0].lines] == [[0.0, 2.0, 4.0], [1.0, 3.0, 5.0]]
+    map_above(around(rng), centres, False, "metres")
+    assert not drawn[1].axes[0].lines
