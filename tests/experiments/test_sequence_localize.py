@@ -243,6 +243,10 @@ def test_success_is_told_of_each_folder_too_and_what_is_doubtful(tmp_path: Path)
     lines = sequence_text(told, summarize(told), scene).splitlines()
     assert "    day: 50.0 / 100.0 % of 2" in lines and "    night: 0.0 / 100.0 % of 1" in lines
     assert not any(line.startswith("    other") for line in lines)
+    assert "  trajectory: times are places in the sequence, as not all queries have a time" in lines
+    back = results_of(scene, [replace(one, timestamp_s=9.0 - one.index) for one in rows])
+    words = sequence_text(back, summarize(back), scene)
+    assert "times are places in the sequence, as those of the queries do not always grow" in words
     wrong = replace(rows[3], status="doubtful", diagnosis="ambiguous")
     rows[2:] = [replace(rows[2], status="doubtful", diagnosis="ok"), wrong, replace(wrong, diagnosis="ok")]
     doubted = results_of(scene, rows)

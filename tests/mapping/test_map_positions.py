@@ -187,7 +187,10 @@ def test_positions_without_heights_are_horizontal(tmp_path):
             "seem to be latitudes and longitudes in degrees, .*: image,lat,lon",
         ),
         ("".join(f"{name} 50.1 8.2 120\n" for name in NAMES), "the same position for all of its 8 images"),
-        ("100.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n", "no pose at the time of any of the 8 images"),
+        (
+            "100.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n",
+            rf"any of the 8 images: its first one is of 100\.5, frame_.* of {CLOCK_S}\.000 s; give times on the same",
+        ),
         ("5000.03 0 0 0 0 0 0 1\n5000.23 0 0 0 0 0 0 1\n", "no pose at the time of any of the 8 images"),
         ("100.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n", "line 3: its time is not after"),
     ],
@@ -256,3 +259,9 @@ def test_a_damaged_scale_is_a_sentence(tmp_path, text):
     (tmp_path / "scale.json").write_text(text)
     with pytest.raises(InputError, match=r"scale\.json: cannot be read \(.*\); remove it, and give the scale again\.$"):
         kept_scale(tmp_path)
+
+
+def test_a_trajectory_for_images_whose_names_hold_no_time(tmp_path):
+    (tmp_path / "poses.txt").write_text("100.5 0 0 0 0 0 0 1\n101.5 0 0 0 0 0 0 1\n")
+    with pytest.raises(InputError, match=r"any of the 1 images; their names must hold it \(names like 1625133000_"):
+        read_positions(tmp_path / "poses.txt", [View("a.jpg", Equirectangular(400, 200), Path("a.jpg"))])

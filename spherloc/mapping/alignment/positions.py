@@ -23,7 +23,7 @@ from spherloc.errors import InputError, shorten, show
 from spherloc.files import open_file
 from spherloc.formats.text_rows import finite_numbers, rows
 from spherloc.frontend.view import View
-from spherloc.trajectory import Trajectory, pose_at, read_euroc, read_tum
+from spherloc.trajectory import NS_PER_S, Trajectory, pose_at, read_euroc, read_tum
 from spherloc.types import BoolArray, FloatArray
 
 MIN_POSITIONS = 4
@@ -104,10 +104,11 @@ def read_positions(path: Path, views: Sequence[View]) -> Positions:
     else:
         return _of_rows(path, views)
     if not found:
-        raise InputError(
-            f"{path}: this trajectory has no pose at the time of any of the {len(views)} images; their names must hold "
-            f"it ({NAME_RULE})."
-        )
+        why = f"; their names must hold it ({NAME_RULE})"
+        if views and (time_ns := time_of(views[0])) is not None:
+            clocks = f"its first one is of {shorten(words[0])}, {shorten(views[0].name)} of {time_ns / NS_PER_S:.3f} s"
+            why = f": {clocks}; give times on the same clock"
+        raise InputError(f"{path}: this trajectory has no pose at the time of any of the {len(views)} images{why}.")
     return Positions(found, f"the trajectory {shorten(path.name)}")
 
 
