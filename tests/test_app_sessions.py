@@ -15,7 +15,7 @@ from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.map_scene import MapScene
 from spherloc.datasets.variation import Variation
 from spherloc.diagnosis import Cause, Diagnosis
-from spherloc.errors import RecordingError
+from spherloc.errors import InputError, RecordingError
 from spherloc.estimators import estimate
 from spherloc.geometry import align_to_down, camera_centre
 from spherloc.trace import Trace
@@ -197,6 +197,40 @@ def test_while_another_scene_opens_nothing_stands_under_its_name(house: House) -
     until(lambda: drawn["map/points"][0].visible and not drawn["cloud/references"][0].visible)
     until(lambda: story._card.content == "" and story._summary.content == shown)
     assert "opacity:.35" not in story._outcome.content
+
+
+def test_while_another_scene_opens_nothing_of_the_one_before_is_offered_for_change(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page, session = house.visit()
+    path = bundled_scenes()["street_fisheye"]
+    street, gate = load_scene(path), threading.Event()
+    assert isinstance(street, MapScene)
+
+    def fail(*given: Any) -> None:
+        gate.wait(LIMIT_S)
+        raise InputError("the map cannot be made.")
+
+    monkeypatch.setattr(MapScene, "stored_problem", lambda *given: None)
+    monkeypatch.setattr(MapScene, "prepare", fail)
+    controls, card = session._controls, session._display.card._panel
+    simulation = controls.scene._simulation
+    session.select([4])
+    session._edits.spoil()
+    session.changed()
+    page.set(controls._movable, True)
+    handle = session._display.canvas._camera._level
+    until(lambda: card.visible and handle.visible and "Matches by hand" in controls._edits.content)
+
+    def offered() -> list[bool]:
+        widgets = (simulation._points, simulation._noise, simulation._folder, controls._movable, controls._edits)
+        return [widget.visible for widget in (*widgets, card, handle)]
+
+    assert all(offered())
+    session.open(RunRequest(SceneRequest(session._catalog.add(street, path), 0), "ransac-2p", None))
+    until(lambda: not any(offered()))
+    gate.set()
+    until(lambda: all(offered()))
 
 
 def test_a_view_that_a_slow_page_drops_is_set_again(house: House, monkeypatch: pytest.MonkeyPatch) -> None:

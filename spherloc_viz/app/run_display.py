@@ -249,7 +249,9 @@ class RunDisplay:
             self.panels.draw(run, plain, pause is not None, outcome, selected, not told, offered, words)
             self.panels.diagnose(*("", "") if hidden else _diagnosed_html(trace, diagnosis, index))
             right = partial(self.canvas.card_is_right, drawn)
-            self.card.draw(trace, selected, run.kept, alternative, right, not told)
+            # While another scene opens, matches of the one before are not offered for change.
+            carded = () if self._map is not None else selected
+            self.card.draw(trace, carded, run.kept, alternative, right, not told)
         nearest = sorted(range(len(timeline)), key=lambda other: (abs(other - index), index - other))
         self._to_prepare = deque(
             partial(self._paint_ahead, run, other, selected, told) for other in nearest[1 : 1 + MAX_AHEAD]

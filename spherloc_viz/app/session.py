@@ -280,9 +280,11 @@ class Session:
             if self._controls.slow.stopped:
                 what = "choose another scene." if self._run is None else "the page still shows the run before."
                 self._status.say(f"Cancelled; {what}")
+            self._controls.end_opening()
             self._display.end_opening()
             return None
         except Exception:
+            self._controls.end_opening()
             self._display.end_opening()
             self._display.panels.mark_stale(True)
             raise

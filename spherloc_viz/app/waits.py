@@ -44,6 +44,7 @@ class Waits:
             if run is None or request.scene != run.request.scene.scene:
                 panels.begin_opening(request.scene)
                 panels.tell_opening("Making the map …", 0.0)
+                self._controls.begin_opening(request.scene)
                 self._display.open_map(request.scene, scene, self._catalog.mesh(request.scene))
                 self._redraw()
 

@@ -185,6 +185,8 @@ class Controls:
         self._presets = presets(catalog)
         self._told: Preset | None = None
         """The preset that was shown last, for as long as its scene is shown."""
+        self._opening = False
+        """Whether another scene than that of the widgets is being opened."""
         self.slow = SlowRun(gui, f"spherloc-clock-{client.client_id}")
         self._moves = gui.add_button_group("", (UNDO, REDO, NEW_SEED))
         self._moves.on_click(self._move)
@@ -266,6 +268,20 @@ class Controls:
             self._show_scene(self.scene.read().scene)
         return another
 
+    def begin_opening(self, label: str) -> None:
+        """Until this scene is at hand, or ``end_opening``, offer nothing for change that belongs to another one."""
+        if label != self.scene.at_hand:
+            self._opening = True
+            self.scene.offer(False)
+            self._movable.visible = False
+            self.sequence.offer(False)
+
+    def end_opening(self) -> None:
+        """The opening has ended without a new run: offer what the scene before has."""
+        if self._opening and self.scene.at_hand:
+            self.scene.offer(True)
+            self._show_scene(self.scene.at_hand)
+
     def write(self, request: RunRequest) -> None:
         """Show this; raises ``InputError`` if it cannot be."""
         self.scene.write(request.scene)
@@ -291,7 +307,8 @@ class Controls:
         """Show what belongs to the newest run; ``diagnosis`` is None until it is ready; ``hidden`` hides answers."""
         self._follow_preset(run.request, hidden)
         self.scene.name_scene(run.request.scene)
-        html = _changes_html(run, self._catalog.synthetic(run.request.scene.scene), hidden)
+        scene = self._catalog.synthetic(run.request.scene.scene)
+        html = "" if self._opening else _changes_html(run, scene, hidden)
         if self._edits.content != html:
             self._edits.content, self._edits.visible = html, bool(html)
         images = self._catalog.map_scene(run.request.scene.scene)
@@ -317,6 +334,7 @@ class Controls:
         return trajectory_items(rows, run.trace.problem.aligned.map_turn, scene.thresholds[-1][1])
 
     def _show_scene(self, label: str) -> None:
+        self._opening = False
         self.sequence.show(label, self._catalog.map_scene(label), self._catalog.path(label))
         self._movable.visible = self._catalog.synthetic(label) is not None
 

@@ -96,12 +96,22 @@ class SceneControls:
         images = self._catalog.map_scene(request.scene)
         if images is not None:
             self._write_query(images, request.query)
-        self._query.visible = images is not None
-        many = images is not None and len(images.queries) > LISTED_QUERIES
-        self._find.visible = self._found.visible = many
         self._simulation.write(self._catalog.synthetic(request.scene), request.variation)
+        self.offer(True)
         put(self._seed, str(request.seed))
         return another
+
+    @property
+    def at_hand(self) -> str:
+        """The label of the scene of which the other widgets tell."""
+        return self._followed
+
+    def offer(self, offered: bool) -> None:
+        """Show the widgets that the scene at hand has, or hide all that belong to it; what they say stays."""
+        images = self._catalog.map_scene(self._followed) if offered else None
+        self._query.visible = images is not None
+        self._find.visible = self._found.visible = images is not None and len(images.queries) > LISTED_QUERIES
+        self._simulation.offer(offered and self._catalog.synthetic(self._followed) is not None)
 
     def name_scene(self, request: SceneRequest) -> None:
         """Show whether the scene at hand is as its name says, by the request of a run of it; nothing for a run of

@@ -63,7 +63,7 @@ class SequencePanel:
 
     def show(self, label: str, scene: MapScene | None, path: Path) -> None:
         """Show the panel for a scene with queries, whose file is ``path``, and hide it for others."""
-        self._folder.visible = scene is not None
+        self.offer(scene is not None)
         another, self._shown = label != self._shown[0], (label, scene)
         self._follow()
         if not another or scene is None:
@@ -73,6 +73,10 @@ class SequencePanel:
         if not rows and self._results is not None:
             what = self._results, label, scene, path
             threading.Thread(target=self._read_kept, args=what, name="spherloc-kept", daemon=True).start()
+
+    def offer(self, offered: bool) -> None:
+        """Show the panel, or hide it; what it says stays."""
+        self._folder.visible = offered
 
     def _read_kept(self, folder: Path, label: str, scene: MapScene, path: Path) -> None:
         """Show what was localized before in a scene, if nothing is localized or has been on this page."""

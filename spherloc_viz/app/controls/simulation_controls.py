@@ -135,11 +135,14 @@ class SimulationControls:
         camera = self._cameras.get(self._camera.value)
         return Variation(camera=camera, true_camera=self._true_camera, **changes)
 
+    def offer(self, offered: bool) -> None:
+        """Show the widgets, or hide them; what they say stays."""
+        for widget in (self._folder, self._points, self._noise, self._outliers, self._kind):
+            widget.visible = offered
+
     def write(self, scene: SyntheticScene | None, variation: Variation) -> None:
         """Show the settings of a scene with a variation; none for a scene that is not a simulation."""
-        self._folder.visible = scene is not None
-        for widget in (self._points, self._noise, self._outliers, self._kind):
-            widget.visible = scene is not None
+        self.offer(scene is not None)
         with self._changes.writing(TRUE_CAMERA) as number:
             if number is not None:
                 self._show_true_camera(variation.true_camera)

@@ -123,6 +123,9 @@ class Canvas:
             self._picture = None
             self._painter.draw(cloud_items(scene, turn) or [dots], layers)
             self._painter.draw_backdrop(mesh, turn, "mesh" in layers)
+        if self._movable:
+            self._camera.show(None, False)
+            self._movable = False
         if label != self._scene and len(places):
             self._scene = label
             self._take(None, views.around(places, self._aspect()), self._aspect())
