@@ -47,6 +47,28 @@ def translation_error_m(truth: FloatArray, estimate: FloatArray) -> float:
     return float(np.linalg.norm(camera_centre(truth) - camera_centre(estimate)))
 
 
+BEYOND = "more than 1,000 times the extent of the map"
+"""What is said instead of a length of which so much is true: no camera that sees the map is so far away."""
+_TIMES = 1000.0
+
+
+def extent_of(points: FloatArray) -> float:
+    """The extent, metres or units of the map, of map points (N, 3): the diagonal of the box that holds nine tenths of
+    them along each axis, as a few may be far away. 0 without points."""
+    return float(np.linalg.norm(np.subtract(*np.percentile(points, (95.0, 5.0), axis=0)))) if len(points) else 0.0
+
+
+def is_beyond(length_m: float, extent_m: float) -> bool:
+    """Whether a length is absurd in a map of that extent (``extent_of``): a pose that few matches give can be
+    anywhere. Never where the extent is 0, as that of one point."""
+    return length_m > _TIMES * extent_m > 0.0
+
+
+def said_length(length_m: float, extent_m: float, text: str) -> str:
+    """The ``text`` of a length; ``BEYOND`` instead if it is absurd in a map of that extent."""
+    return BEYOND if is_beyond(length_m, extent_m) else text
+
+
 def precision_recall_f1(truth: BoolArray, reported: BoolArray) -> tuple[float, float, float]:
     """Scores of a reported inlier mask (N,) against the true one (N,); 0 where a denominator is 0."""
     hits = float(np.count_nonzero(truth & reported))

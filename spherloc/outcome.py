@@ -23,7 +23,7 @@ from spherloc.diagnosis.evidence import MIN_SDS, STRONG, agreeing, different, sd
 from spherloc.diagnosis.rival import rival_of
 from spherloc.free_gravity import MAX_NFA, MIN_LEAD, count_distinct, expected_by_chance, lead, nearby_support
 from spherloc.gauss_newton import MIN_GRAVITY_SD_RAD
-from spherloc.metrics import SUCCESS_DEG, SUCCESS_M
+from spherloc.metrics import SUCCESS_DEG, SUCCESS_M, extent_of, is_beyond
 from spherloc.problem import AlignedProblem
 from spherloc.refine import gravity_sd_rad, residuals_px
 from spherloc.trace import ConsensusStage, RefinementStage, Trace
@@ -173,6 +173,8 @@ def _error_margin(trace: Trace, aligned: AlignedProblem, state: FloatArray, inli
     rotation, position = sd_of(aligned, state, inliers, trace.options)
     if np.isinf(position):
         return -np.inf, "Its inliers do not fix it."
+    if is_beyond(position, extent_of(trace.problem.points)):
+        return -np.inf, "Its inliers do not fix its position."
     worst = MIN_SDS * max(np.degrees(rotation) / SUCCESS_DEG, position / SUCCESS_M, 1e-300)
     fixed = f"{np.degrees(rotation):.2g}° and {position:.2g} {trace.problem.unit}"
     return -np.log(worst), f"Its inliers fix it to no better than {fixed} (1 sd)."

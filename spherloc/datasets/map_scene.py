@@ -20,6 +20,8 @@ from spherloc.frontend.masks import MAX_NADIR_DEG, MAX_SEAM_DEG, Masks, with_mas
 from spherloc.frontend.pipeline import ImageMatcher, image_matcher
 from spherloc.frontend.stored_matches import StoredMatches
 from spherloc.frontend.view import Gravity, Matcher, Matches, NeedsPreparing, Report, View
+from spherloc.geometry import camera_centre
+from spherloc.metrics import extent_of, is_beyond
 from spherloc.problem import Problem
 from spherloc.refine import residuals_px
 from spherloc.types import FloatArray
@@ -103,6 +105,28 @@ class MapScene:
     @cached_property
     def _by_name(self) -> Mapping[str, View]:
         return {view.name: view for view in self.queries}
+
+    @cached_property
+    def _places(self) -> FloatArray:
+        """Positions (K, 3) in the map frame: of its points, if they are known, and of its references with a pose."""
+        poses = [view.cam_from_map for view in self.references if view.cam_from_map is not None]
+        cloud = [] if self.cloud is None else [self.cloud]
+        return np.vstack([np.empty((0, 3)), *(camera_centre(pose) for pose in poses), *cloud])
+
+    @cached_property
+    def _middle(self) -> FloatArray:
+        return np.median(self._places, axis=0)
+
+    @cached_property
+    def extent_m(self) -> float:
+        """The extent of the map (``spherloc.metrics.extent_of``), metres or units of the map; 0 if it is not known."""
+        return extent_of(self._places)
+
+    def is_away(self, cam_from_map: FloatArray) -> bool:
+        """Whether a pose (3, 4) is absurdly far away from the map (``spherloc.metrics.is_beyond``)."""
+        if not len(self._places):
+            return False
+        return is_beyond(float(np.linalg.norm(camera_centre(cam_from_map) - self._middle)), self.extent_m)
 
     def query(self, name: str | None = None) -> View:
         """The query image of that name, by default the first.

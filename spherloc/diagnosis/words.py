@@ -7,7 +7,8 @@ import numpy as np
 from spherloc.consensus.chance import expected_text
 from spherloc.diagnosis.causes import Cause, Diagnosis
 from spherloc.diagnosis.evidence import MISSED, STRONG, Evidence, Fit, Narrow, Truth, apart, different, undetermined
-from spherloc.metrics import evaluate
+from spherloc.metrics import BEYOND, evaluate, extent_of, said_length
+from spherloc.problem import Problem
 from spherloc.trace import Certificate, ConsensusStage, RansacStage, Trace
 
 ADVICE = {
@@ -40,7 +41,7 @@ def describe(
         other, summary = narrow.fit, _narrow_summary(e, narrow)
     else:
         other = _fit_beside(e, truth, cause)
-        summary = _summary(e, truth, cause, other, trace.problem.unit)
+        summary = _summary(e, truth, cause, other, trace.problem)
     return Diagnosis(
         cause=cause,
         doubtful=cause is not Cause.OK,
@@ -109,7 +110,7 @@ def _fit_beside(e: Evidence, truth: Truth | None, cause: Cause) -> Fit | None:
     return None
 
 
-def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, unit: str) -> str:
+def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, problem: Problem) -> str:
     total, bound = len(e.aligned.points), e.bound_px
     run, best, second = (0 if fit is None else fit.support(bound) for fit in (e.run, e.best, other))
     match cause:
@@ -147,7 +148,7 @@ def _summary(e: Evidence, truth: Truth | None, cause: Cause, other: Fit | None, 
             return f"The search missed the best pose: one with {better} of {total} matches exists, the run's has {run}."
         case Cause.UNKNOWN:
             return f"The pose is off the true one, though {run} of {total} matches agree with it and fix it well."
-    return _measured_summary(e, truth, cause, unit)
+    return _measured_summary(e, truth, cause, problem)
 
 
 def _strong(e: Evidence) -> bool:
@@ -189,14 +190,16 @@ def _compared(e: Evidence, truth: Truth | None, run: int) -> str:
     return "and no other pose comes near"
 
 
-def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause, unit: str) -> str:
+def _measured_summary(e: Evidence, truth: Truth | None, cause: Cause, problem: Problem) -> str:
     """Summary of causes that are a measured size: from the true pose or, without it, from the pose that ignores the
     given gravity and has a wider bound."""
     if cause is Cause.DEGENERATE:
         source = e if truth is None else truth
-        fixed = f"{_distance(source.position_sd_m, unit)} and {_deg(source.rotation_sd_rad)}"
+        fixed = f"{_distance(source.position_sd_m, problem)} and {_deg(source.rotation_sd_rad)}"
         if truth is None and e.reported_sd and not undetermined(e.rotation_sd_rad, e.position_sd_m):
-            fixed = f"{_distance(e.reported_sd[1], unit)} and {_deg(e.reported_sd[0])}"
+            fixed = f"{_distance(e.reported_sd[1], problem)} and {_deg(e.reported_sd[0])}"
+        if BEYOND in fixed:
+            return "The matches that agree do not fix the position."
         return f"The matches that agree fix the pose to no better than {fixed} (1 sd)."
     fit = truth.fit if truth is not None else e.tilted if cause is Cause.GRAVITY_OFF else e.free
     if fit is None:
@@ -233,12 +236,12 @@ def _sentences(trace: Trace, e: Evidence, truth: Truth | None, certificate: Cert
             finder = "Before refinement the run had" if _had_best(trace, best) else "A longer search finds"
             yield f"{finder} a pose that {best} agree with{fewer}."
         if np.isfinite(e.position_sd_m):
-            fixed = f"{_distance(e.position_sd_m, trace.problem.unit)} and {_deg(e.rotation_sd_rad)}"
+            fixed = f"{_distance(e.position_sd_m, trace.problem)} and {_deg(e.rotation_sd_rad)}"
             yield f"The {best} fix their pose to {fixed} (1 sd)."
         yield f"Sets of {best} that agree by chance: {expected_text(e.nfa(best))} expected."
     if e.best is not None and e.alternative is not None and e.alternative.support(bound) > 1:
         turn, distance = apart(e.best.cam_from_map, e.alternative.cam_from_map)
-        away = f"{_distance(distance, trace.problem.unit)} and {_deg(turn)}"
+        away = f"{_distance(distance, trace.problem)} and {_deg(turn)}"
         yield f"The next pose, {away} away from the best, has {e.alternative.support(bound)}."
     if e.free is not None and np.isfinite(e.free_tilt_sd_rad):
         one, two, four = (e.free.support(factor * bound) for factor in (1, 2, 4))
@@ -282,13 +285,13 @@ def _truths(trace: Trace, e: Evidence, truth: Truth) -> Iterator[str]:
     what = "match is" if right == 1 else "matches are"
     yield f"Truth: {right} {what} right, and {at} agree{'s' * (at == 1)} with the true pose{more}."
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
-        error = f"{_distance(metrics.translation_error_m, trace.problem.unit)} and {metrics.rotation_error_deg:.3g}°"
+        error = f"{_distance(metrics.translation_error_m, trace.problem)} and {metrics.rotation_error_deg:.3g}°"
         yield f"Truth: the run's pose is off by {error}; the known gravity by {_deg(truth.exact.tilt_rad)}."
     best = 0 if e.best is None else e.best.support(e.bound_px)
     if e.best is not None and (e.run is None or best > e.run.support(e.bound_px)):
         turn, distance = apart(e.best.cam_from_map, truth.exact.cam_from_map)
         which = "before refinement" if _had_best(trace, best) else "of the longer search"
-        yield f"Truth: the pose {which} is off by {_distance(distance, trace.problem.unit)} and {_deg(turn)}."
+        yield f"Truth: the pose {which} is off by {_distance(distance, trace.problem)} and {_deg(turn)}."
 
 
 def _deg(angle_rad: float) -> str:
@@ -300,7 +303,8 @@ def px_text(size_px: float) -> str:
     return f"{size_px:.3g} px" if size_px < 1000 else f"{size_px:,.0f} px"
 
 
-def _distance(distance: float, unit: str) -> str:
-    if unit == "m" and distance < 1.0:
+def _distance(distance: float, problem: Problem) -> str:
+    if problem.metric and distance < 1.0:
         return f"{100.0 * distance:.2g} cm"
-    return f"{distance:.2g} {unit}" if distance < 100 else f"{distance:.0f} {unit}"
+    text = f"{distance:.2g} {problem.unit}" if distance < 100 else f"{distance:.0f} {problem.unit}"
+    return said_length(distance, extent_of(problem.points), text)

@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 
 from spherloc.diagnosis import Diagnosis
-from spherloc.metrics import evaluate
+from spherloc.metrics import evaluate, extent_of
 from spherloc.outcome import Outcome, known_judgement
 from spherloc.trace import Trace
 from spherloc_viz import style
@@ -169,7 +169,7 @@ def summary_of(trace: Trace) -> tuple[str, list[str]]:
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         facts = [
             angle_text(metrics.rotation_error_deg),
-            length(metrics.translation_error_m, trace.problem.metric),
+            length(metrics.translation_error_m, trace.problem.metric, extent_of(trace.problem.points)),
             *facts,
         ]
     judged = known_judgement(trace)

@@ -16,7 +16,7 @@ from spherloc.datasets.variation import Variation, used_seed
 from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import InputError, RecordingError, SpherlocError, legible
 from spherloc.estimators import default_options, options_type
-from spherloc.metrics import evaluate
+from spherloc.metrics import evaluate, extent_of, said_length
 from spherloc.outcome import Outcome, count_within_noise, judge
 from spherloc.problem import Problem
 from spherloc.trace import Trace
@@ -230,7 +230,8 @@ def as_record(path: Path, trace: Trace, diagnosis: Diagnosis, recording: Path | 
 
 
 def _length(metres: float, problem: Problem) -> str:
-    return f"{100 * metres:.2f} cm" if problem.metric else f"{metres:.3g} {problem.unit}"
+    text = f"{100 * metres:.2f} cm" if problem.metric else f"{metres:.3g} {problem.unit}"
+    return said_length(metres, extent_of(problem.points), text)
 
 
 def _gravity(problem: Problem) -> str:

@@ -13,6 +13,8 @@ from spherloc.experiments.summary import SuccessRate, Summary, TrajectoryError, 
 from spherloc.frontend.gravity_from_lines import why_not_found
 from spherloc.frontend.pipeline import NO_POINT
 from spherloc.mapping.scenes.joint_outcome import TRIED, tried_anew
+from spherloc.metrics import said_length
+from spherloc_viz.layers.frame import AWAY
 from spherloc_viz.layers.where_taken import nearest
 
 MAX_TOLD, MAX_EACH = 5, 20
@@ -41,12 +43,13 @@ def sequence_text(results: SequenceResults, summary: Summary, scene: MapScene) -
     rates = (*summary.success, *summary.registration_success)
     lines += [f"  success {_rate(rate, setting.unit)}" for rate in rates if rate.judged or not summary.without_truth]
     lines += [f"  {line}" for line in _by_folder(results)]
-    if summary.median_rotation_error_deg is not None and summary.median_translation_error_m is not None:
+    error_m = summary.median_translation_error_m
+    if summary.median_rotation_error_deg is not None and error_m is not None:
         lines.append(
             f"  median error {summary.median_rotation_error_deg:.3f} deg and "
-            f"{setting.length(summary.median_translation_error_m)}, of queries with a pose"
+            f"{said_length(error_m, scene.extent_m, setting.length(error_m))}, of queries with a pose"
         )
-    lines += [f"  {line}" for line in _trajectory_lines(summary.trajectory, setting)]
+    lines += [f"  {line}" for line in _trajectory_lines(summary.trajectory, setting, scene.extent_m)]
     if scene.about_truth and summary.success:
         lines.append(f"  {scene.about_truth[0].lower()}{scene.about_truth[1:].removesuffix('.')}")
     if summary.median_registration_error_m is not None:
@@ -129,6 +132,8 @@ def _each(results: SequenceResults, scene: MapScene) -> Iterator[str]:
         agree = f"{row.inliers or 0:,} of {row.matches or 0:,} matches agree"
         near = nearest(scene, row.cam_from_map, images.get(row.query)) if row.cam_from_map is not None else ""
         place = f"at ({at}), {near}" if near else f"at ({at})"
+        if row.cam_from_map is not None and scene.is_away(row.cam_from_map):
+            place = f"at {AWAY}"
         yield f"{row.query}: {row.status}{_why(row)}, {place}, {agree}{off}"
     if told:
         yield "expected errors are what the noise of the matches leaves; errors of the map and of the lens add to them"
@@ -142,18 +147,22 @@ def _why(row: QueryResult) -> str:
     return " (right, as the truth shows)" if right else ""
 
 
-def _trajectory_lines(error: TrajectoryError | None, setting: Configuration) -> Iterator[str]:
-    """Lines on ATE and RPE of all poses."""
+def _trajectory_lines(error: TrajectoryError | None, setting: Configuration, extent_m: float) -> Iterator[str]:
+    """Lines on ATE and RPE of all poses, in a map of that extent."""
     if error is None:
         return
+
+    def said(length_m: float) -> str:
+        return said_length(length_m, extent_m, setting.length(length_m))
+
     aligned = [
-        f"{setting.length(value)} {how}"
+        f"{said(value)} {how}"
         for value, how in ((error.ate_rigid_m, "aligned rigidly"), (error.ate_similarity_m, "with scale"))
         if value is not None
     ]
-    yield f"ATE of all {error.poses} poses: {', '.join([setting.length(error.ate_m), *aligned])}"
+    yield f"ATE of all {error.poses} poses: {', '.join([said(error.ate_m), *aligned])}"
     if error.rpe_m is not None:
-        yield f"RPE from pose to pose: {setting.length(error.rpe_m)}, {error.rpe_deg:.3f} deg"
+        yield f"RPE from pose to pose: {said(error.rpe_m)}, {error.rpe_deg:.3f} deg"
 
 
 def gravity_by_source(rows: Sequence[QueryResult]) -> Iterator[str]:

@@ -8,7 +8,8 @@ import numpy as np
 from spherloc import registry
 from spherloc.diagnosis import Diagnosis
 from spherloc.geometry import camera_centre, yaw_of
-from spherloc.metrics import evaluate
+from spherloc.metrics import evaluate, extent_of, is_beyond
+from spherloc.problem import Problem
 from spherloc.refine import residuals_px
 from spherloc.trace import Certificate, ConsensusStage, Trace, YawStage
 from spherloc.types import FloatArray
@@ -94,7 +95,7 @@ def _row(entry: Entry) -> tuple[str, ...]:
         trace.estimator,
         outcome(trace),
         NO_VALUE if turn is None else f"{turn:.3f}°" if turn < 10 else f"{turn:.0f}°",
-        NO_VALUE if shift is None else _length(shift, trace.problem.metric),
+        NO_VALUE if shift is None else _length(shift, trace.problem),
         f"{np.count_nonzero(trace.inlier_mask)}",
         *(
             NO_VALUE if share is None or trace.cam_from_map is None else f"{100 * share:.0f} %"
@@ -113,9 +114,10 @@ def outcome(trace: Trace) -> str:
     return {True: "success", False: "failure", None: "unknown"}[evaluate(trace).success]
 
 
-def _length(metres: float, metric: bool) -> str:
-    if not metric:
-        return length_text(metres, metric)
+def _length(metres: float, problem: Problem) -> str:
+    extent_m = extent_of(problem.points)
+    if not problem.metric or is_beyond(metres, extent_m):
+        return length_text(metres, problem.metric, extent_m)
     return f"{100 * metres:.2f} cm" if metres < 1.0 else f"{metres:.2f} m" if metres < 100 else f"{metres:.0f} m"
 
 

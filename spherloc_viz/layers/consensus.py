@@ -6,7 +6,7 @@ from functools import cache, partial
 import numpy as np
 
 from spherloc.geometry import camera_centre, yaw_of, yaw_rotation
-from spherloc.metrics import rotation_error_deg, translation_error_m
+from spherloc.metrics import BEYOND, rotation_error_deg, translation_error_m
 from spherloc.trace import ConsensusStage, PositionStage
 from spherloc.types import ByteArray, FloatArray
 from spherloc_viz import style
@@ -310,15 +310,14 @@ def _pose(view: RunView, stage: ConsensusStage, rank: int) -> Frame:
     explained = np.zeros(len(view.points), dtype=bool)
     aligned = view.trace.problem.aligned
     explained[aligned.index] = view.residuals_px(state)[aligned.index] <= view.bounds.noise_px
-    unit = view.trace.problem.unit
-    off = "" if view.truth is None else f", {translation_error_m(view.truth, state):.3f} {unit} from the true one"
+    off = "" if view.truth is None else f", {_off(view, state)} from the true one"
     if rank == 0:
         then = "No other pose that was tried explains more, so it is what refinement starts from."
     else:
         best = view.aligned_pose(stage.cam_from_map[0])
         away, turned = translation_error_m(best, state), rotation_error_deg(best, state)
         both = np.count_nonzero(explained & view.mask(stage.clique))
-        apart = f"{away:.2f} {unit} and {turned:.1f}° away"
+        apart = f"{view.fixed_length(away, 2)} and {turned:.1f}° away"
         then = f"It is {apart} from the best pose, and shares {both} matches with the set."
     return Frame(
         f"The pose at {view.position(state)}{off} explains {support} of {len(view.points)} matches. {then}",
@@ -330,12 +329,18 @@ def _pose(view: RunView, stage: ConsensusStage, rank: int) -> Frame:
     )
 
 
+def _off(view: RunView, state: FloatArray) -> str:
+    """How far an aligned pose is from the true one, which is known."""
+    assert view.truth is not None
+    return view.fixed_length(translation_error_m(view.truth, state), 3)
+
+
 def _poses(view: RunView, stage: ConsensusStage) -> Frame:
     states = [view.aligned_pose(state) for state in stage.cam_from_map[: 1 + style.MAX_DRAWN_ALTERNATIVES]]
     alternatives, count, most = states[1:], len(stage.support), highest_bound(stage)
     if alternatives:
         away, turned = translation_error_m(states[0], states[1]), rotation_error_deg(states[0], states[1])
-        apart = f"{away:.2f} {view.trace.problem.unit} and {turned:.1f}° away"
+        apart = f"{view.fixed_length(away, 2)} and {turned:.1f}° away"
         other = f"The best other pose, {apart}, explains {stage.support[1]}"
     else:
         other = "No clearly different pose was found beside it"
@@ -372,8 +377,9 @@ def _table(view: RunView, stage: ConsensusStage, states: list[FloatArray]) -> Ta
     rows, unit = [], view.trace.problem.unit
     for rank, (state, support) in enumerate(zip(states, stage.support, strict=False), 1):
         centre = camera_centre(view.trace.problem.aligned.unalign_pose(state))
-        place = " ".join(f"{value:.2f}" for value in centre)
-        off = () if view.truth is None else (f"{translation_error_m(view.truth, state):.3f} {unit}",)
+        away = view.is_away(camera_centre(state))
+        place = BEYOND if away else " ".join(f"{value:.2f}" for value in centre)
+        off = () if view.truth is None else (_off(view, state),)
         rows.append((str(rank), str(support), f"{np.degrees(yaw_of(state[:, :3])):.2f}°", place, *off))
     columns = ("", "explains", "yaw", f"camera ({unit})", *(() if view.truth is None else ("off the truth",)))
     return Table("verified poses", columns, tuple(rows))

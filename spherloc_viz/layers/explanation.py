@@ -6,7 +6,8 @@ import numpy as np
 
 from spherloc.diagnosis.words import px_text
 from spherloc.geometry import yaw_of
-from spherloc.metrics import evaluate, rotation_error_deg, translation_error_m
+from spherloc.metrics import evaluate, extent_of, rotation_error_deg, said_length, translation_error_m
+from spherloc.problem import Problem
 from spherloc.trace import ConsensusStage, RansacStage, Trace, TranslationStage, YawStage
 from spherloc.types import BoolArray, FloatArray, IndexArray, IntArray
 from spherloc_viz.layers.agreement import PartnerArcs, partner_arcs, unbounded
@@ -122,7 +123,7 @@ def _by_truth(poses: Poses) -> str:
 def _by_alternative(trace: Trace, poses: Poses) -> str:
     if poses.alternative is None or not poses.alternative[1] <= poses.bound_px or trace.cam_from_map is None:
         return ""
-    away = _between(trace.cam_from_map, poses.alternative[0], trace.problem.unit)
+    away = _between(trace.cam_from_map, poses.alternative[0], trace.problem)
     return f"It agrees with another pose, {away} from the estimated one."
 
 
@@ -141,11 +142,13 @@ def _off(residual: tuple[float, float]) -> str:
 
 def _away(trace: Trace) -> str:
     truth, estimate = trace.problem.truth_cam_from_map, trace.cam_from_map
-    return "" if truth is None or estimate is None else _between(truth, estimate, trace.problem.unit)
+    return "" if truth is None or estimate is None else _between(truth, estimate, trace.problem)
 
 
-def _between(one: FloatArray, other: FloatArray, unit: str) -> str:
-    return f"{translation_error_m(one, other):.2f} {unit} and {rotation_error_deg(one, other):.1f}°"
+def _between(one: FloatArray, other: FloatArray, problem: Problem) -> str:
+    away_m = translation_error_m(one, other)
+    away = said_length(away_m, extent_of(problem.points), f"{away_m:.2f} {problem.unit}")
+    return f"{away} and {rotation_error_deg(one, other):.1f}°"
 
 
 WORST = 3

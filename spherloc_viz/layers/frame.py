@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds, bounds_of
 from spherloc.geometry import camera_centre, pose
+from spherloc.metrics import BEYOND, extent_of, is_beyond, said_length
 from spherloc.refine import residuals_px
 from spherloc.trace import Trace
 from spherloc.types import BoolArray, ByteArray, FloatArray
@@ -195,7 +196,22 @@ class RunView:
 
     def place(self, position: FloatArray) -> str:
         """A place (3,) of the aligned map frame in the problem's own map frame, as text."""
+        if self.is_away(position):
+            return AWAY
         return place_text(self.trace.problem.aligned.map_turn.T @ position, 2, self.metric)
+
+    def is_away(self, position: FloatArray) -> bool:
+        """Whether a place (3,) of the aligned map frame is absurdly far away from the map."""
+        return is_beyond(float(np.linalg.norm(position - self._median)), self.extent_m)
+
+    @property
+    def _median(self) -> FloatArray:
+        return self.of_map("median", lambda: np.median(self.points, axis=0))
+
+    @property
+    def extent_m(self) -> float:
+        """The extent of the map points, see ``spherloc.metrics.extent_of``."""
+        return self.of_map("extent", lambda: extent_of(self.points))
 
     @property
     def metric(self) -> bool:
@@ -204,11 +220,15 @@ class RunView:
 
     def length(self, metres: float) -> str:
         """A length as text, see ``length``."""
-        return length(metres, self.metric)
+        return length(metres, self.metric, self.extent_m)
 
     def length_text(self, metres: float) -> str:
         """A length as text, see ``length_text``."""
-        return length_text(metres, self.metric)
+        return length_text(metres, self.metric, self.extent_m)
+
+    def fixed_length(self, metres: float, digits: int) -> str:
+        """A length as text with that many digits behind the point, in metres or units of the map; see ``length``."""
+        return said_length(metres, self.extent_m, f"{metres:.{digits}f} {self.trace.problem.unit}")
 
     def right_ones(self, indices: np.ndarray) -> str:
         """Number of right ones among these correspondences, as part of a sentence; empty if unknown."""
@@ -260,14 +280,21 @@ def growing(total: int, *sizes: int) -> list[int]:
     return [size for size in sizes if size < total]
 
 
+AWAY = f"a place {BEYOND} away, which cannot be"
+"""What is said instead of coordinates of a camera that cannot be there."""
+
+
 def place_text(position: FloatArray, digits: int, metric: bool = True) -> str:
     """A position (3,) as text, in metres or, if not ``metric``, units of the map."""
     unit = "m" if metric else UNITS
     return f"({', '.join(f'{value:.{digits}f}' for value in position)}) {unit}".replace("-", "−")
 
 
-def length(metres: float, metric: bool = True) -> str:
-    """A length as text: in metres, or centimetres if it is short; if not ``metric``, in units of the map."""
+def length(metres: float, metric: bool = True, extent_m: float = np.inf) -> str:
+    """A length as text: in metres, or centimetres if it is short; if not ``metric``, in units of the map. In words if
+    it is absurd in a map of that extent (``spherloc.metrics.extent_of``)."""
+    if is_beyond(metres, extent_m):
+        return BEYOND
     if not metric:
         return f"{metres:.3g} {UNITS}"
     if metres >= 1.0:
@@ -284,8 +311,11 @@ UNIT, UNITS = "unit", "units"
 """Unit of a map whose scale is unknown."""
 
 
-def length_text(length_m: float, metric: bool = True) -> str:
-    """A length as text with two digits, in a unit that suits its size; if not ``metric``, in units of the map."""
+def length_text(length_m: float, metric: bool = True, extent_m: float = np.inf) -> str:
+    """A length as text with two digits, in a unit that suits its size; if not ``metric``, in units of the map. In words
+    if it is absurd in a map of that extent (``spherloc.metrics.extent_of``)."""
+    if is_beyond(length_m, extent_m):
+        return BEYOND
     if not metric:
         return f"{length_m:.2g} {UNIT if length_m == 1.0 else UNITS}"
     if 0.0 < length_m < MIN_M:

@@ -5,12 +5,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from spherloc.geometry import camera_centre
-from spherloc.metrics import SUCCESS_M, evaluate
+from spherloc.metrics import SUCCESS_M, evaluate, extent_of, is_beyond
 from spherloc.outcome import Judgement, Outcome, count_within_noise, judge
+from spherloc.problem import Problem
 from spherloc.trace import Certificate, RefinementStage, Trace
+from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
-from spherloc_viz.layers.frame import Frame, Plan, RunView, angle_text, length, map_focus, place_text
+from spherloc_viz.layers.frame import AWAY, Frame, Plan, RunView, angle_text, length, map_focus, place_text
 from spherloc_viz.layers.primitives import Table
 
 KNOWABLE = 0.01
@@ -146,19 +148,19 @@ def outcome_table(trace: Trace) -> Table:
 
 def early_table(trace: Trace, judged: Judgement | None) -> Table:
     """The same with the judgement if it is known already, since judging can take longer than the run."""
-    metrics = evaluate(trace)
+    metrics, extent_m = evaluate(trace), extent_of(trace.problem.points)
     rows: list[tuple[str, str]] = [("estimator", trace.estimator), ("outcome", verdict(trace, metrics.success))]
     if trace.cam_from_map is not None:
         rows.append(("judged without the truth", "…" if judged is None else _judged(judged, metrics.success)))
-        rows.append(("camera position", place_text(camera_centre(trace.cam_from_map), 3, trace.problem.metric)))
+        rows.append(("camera position", _place(trace.problem, camera_centre(trace.cam_from_map), extent_m)))
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         rows.append(("rotation error", f"{metrics.rotation_error_deg:.3f}°"))
-        rows.append(("position error", length(metrics.translation_error_m, trace.problem.metric)))
+        rows.append(("position error", length(metrics.translation_error_m, trace.problem.metric, extent_m)))
     refinement = trace.stage(RefinementStage)
     if refinement is not None and trace.cam_from_map is not None:
         doubted = metrics.success is False or (judged is not None and judged.outcome is not Outcome.LOCALIZED)
         condition = ", if its inliers are right" if doubted and refinement.expected_errors is not None else ""
-        rows.append(("expected error", uncertainty.spread(refinement, trace.problem.metric) + condition))
+        rows.append(("expected error", uncertainty.spread(refinement, trace.problem.metric, extent_m) + condition))
     inliers, explained = int(np.count_nonzero(trace.inlier_mask)), count_within_noise(trace)
     within = f", {explained} within the bound on the noise" if explained < inliers else ""
     rows.append(("inliers", f"{inliers} of {len(trace.problem)}{within}"))
@@ -169,6 +171,11 @@ def early_table(trace: Trace, judged: Judgement | None) -> Table:
         rows += _certificate_rows(trace.certificate, explained)
     rows.append(("solved in", _times(trace.timings_ms)))
     return Table("outcome", ("", "this run"), tuple(rows))
+
+
+def _place(problem: Problem, position: FloatArray, extent_m: float) -> str:
+    away_m = float(np.linalg.norm(position - np.median(problem.points, axis=0)))
+    return AWAY if is_beyond(away_m, extent_m) else place_text(position, 3, problem.metric)
 
 
 def _times(timings_ms: Mapping[str, float]) -> str:

@@ -169,7 +169,7 @@ def _error(view: RunView, stage: RefinementStage) -> Frame:
         view.no_matches(),
         note=uncertainty.tilt(stage),
         located=True,
-        tables=(uncertainty.table(stage, view.metric),),
+        tables=(uncertainty.table(stage, view.metric, view.extent_m),),
         focus=_error_focus(view, state),
     )
 
@@ -189,14 +189,14 @@ def _summary(view: RunView, stage: RefinementStage) -> Frame:
         f"{_steps(len(rms) - 1)} in {stage.dof} degrees of freedom {'takes' if len(rms) == 2 else 'take'} the inliers "
         f"from {rms[0]:.2f} to {rms[-1]:.2f} px RMS, and their number from {counts[0]} to {counts[-1]}. "
         f"The camera ends at {view.position(state)}, and its expected error "
-        f"is {uncertainty.spread(stage, view.metric)}.",
+        f"is {uncertainty.spread(stage, view.metric, view.extent_m)}.",
         _objective(stage),
         state,
         view.colors(style.UNDECIDED, (mask, style.INLIER)),
         mask,
         note=uncertainty.tilt(stage),
         located=True,
-        tables=(uncertainty.table(stage, view.metric),),
+        tables=(uncertainty.table(stage, view.metric, view.extent_m),),
     )
 
 

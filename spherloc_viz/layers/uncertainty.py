@@ -125,13 +125,13 @@ def _angle(view: RunView, frame: Frame) -> list[SceneItem]:
     return [Segments("uncertainty/angle", LAYER, np.stack([starts, ends], axis=1), colors, 2.0)]
 
 
-def spread(stage: RefinementStage, metric: bool = True) -> str:
-    """How far the pose is off in words; if not ``metric``, in units of the map."""
+def spread(stage: RefinementStage, metric: bool = True, extent_m: float = np.inf) -> str:
+    """How far the pose is off in words; if not ``metric``, in units of the map, whose extent is ``extent_m``."""
     known = stage.expected_errors
     return (
         "unknown: the inliers leave it open"
         if known is None
-        else f"{angle_text(known[0])} and {length(known[1], metric)} RMS"
+        else f"{angle_text(known[0])} and {length(known[1], metric, extent_m)} RMS"
     )
 
 
@@ -145,10 +145,11 @@ def tilt(stage: RefinementStage) -> str:
     return f"{leans}, which was trusted to {np.degrees(stage.gravity_sd_rad):.3g}° (standard deviation)."
 
 
-def table(stage: RefinementStage, metric: bool = True) -> Table:
-    """Standard deviations by axis; if not ``metric``, positions are in units of the map."""
+def table(stage: RefinementStage, metric: bool = True, extent_m: float = np.inf) -> Table:
+    """Standard deviations by axis; if not ``metric``, positions are in units of the map, whose extent is
+    ``extent_m``."""
     deviations = np.sqrt(np.diagonal(stage.covariance))
-    places = (length(value, metric) if np.isfinite(value) else "open" for value in deviations[3:])
+    places = (length(value, metric, extent_m) if np.isfinite(value) else "open" for value in deviations[3:])
     rows = (
         ("rotation about x, y, z", _listed(np.degrees(deviations[:3]), "{:.3f}°")),
         ("position x, y, z", ", ".join(places)),

@@ -9,7 +9,7 @@ from spherloc.errors import shorten
 from spherloc.geometry import camera_centre
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
-from spherloc_viz.layers.frame import length_text
+from spherloc_viz.layers.frame import AWAY, length_text
 
 NAMED = 2
 """Largest number of references that are named."""
@@ -23,7 +23,7 @@ def where_taken(scene: MapScene, trace: Trace) -> str:
     if trace.cam_from_map is None:
         return ""
     image = trace.problem.image
-    told = nearest(scene, trace.cam_from_map, image)
+    told = f"at {AWAY}" if scene.is_away(trace.cam_from_map) else nearest(scene, trace.cam_from_map, image)
     if not told:
         return ""
     truth = ""

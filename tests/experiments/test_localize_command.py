@@ -453,9 +453,10 @@ def test_what_other_queries_say_is_written_and_told(
     assert [row["status"] for row in table(out)] == list(results.status) and table(out)[2]["inliers"] == "7"
     assert json.loads((out / "summary.json").read_text())["doubtful"] == 1
     assert results.recordings[1] is None and results.recordings[2] is not None and results.recordings[2].exists()
-    assert said_of("image1.png", results.rows[1], "m").endswith(why) and not results.rows[0].doubts
     loaded = load_scene(scene)
-    assert isinstance(loaded, MapScene) and f"image1.png is doubtful: {why}" in sequence_html(results.rows, loaded)
+    assert isinstance(loaded, MapScene)
+    assert said_of("image1.png", results.rows[1], loaded).endswith(why) and not results.rows[0].doubts
+    assert f"image1.png is doubtful: {why}" in sequence_html(results.rows, loaded)
     aligned = replace(loaded, truth_source="mocap0, aligned with the map")
     assert "The true poses are those of mocap0, aligned with the map." in sequence_html(results.rows, aligned)
     assert "  the true poses are those of mocap0, al" in sequence_text(results, summarize(results), aligned)

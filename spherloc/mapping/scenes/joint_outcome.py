@@ -22,6 +22,7 @@ from spherloc.geometry import camera_centre, rotation_angle, transform
 from spherloc.mapping.models.later import EXPECTED_RAD, MIN_INLIERS
 from spherloc.mapping.rig import MIN_TOGETHER, TURNED_RAD, FixedCameras, rig_of
 from spherloc.mapping.scenes.neighbours import jumps
+from spherloc.metrics import said_length
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
 
@@ -121,18 +122,18 @@ class _Judged:
         """The queries by name."""
         return {view.name: view for view in self.scene.queries}
 
-    @property
-    def unit(self) -> str:
-        """Of lengths in the map."""
-        return "m" if self.scene.metric else "units"
+    def length(self, length_m: float) -> str:
+        """A length in the map as text."""
+        text = f"{length_m:.2g} {'m' if self.scene.metric else 'units'}"
+        return said_length(length_m, self.scene.extent_m, text)
 
     def compare_neighbours(self) -> None:
         """Doubt queries that are far from those before and after them."""
         limit = self.scene.thresholds[-1][1]
         for name, jump in jumps(tuple(self.rows.values()), limit).items():
             self.rows[name] = self.rows[name].doubted(
-                f"{_BETWEEN} {jump.before} and {jump.after}, which are {jump.apart:.2g} {self.unit} apart, it is "
-                f"{jump.away:.2g} {self.unit} or more from both; it may be of a place that looks alike."
+                f"{_BETWEEN} {jump.before} and {jump.after}, which are {self.length(jump.apart)} apart, it is "
+                f"{self.length(jump.away)} or more from both; it may be of a place that looks alike."
             )
 
 
@@ -203,7 +204,7 @@ class _Together:
         off = float(np.linalg.norm(camera_centre(expected) - camera_centre(found)))
         turned_rad = rotation_angle(found[:, :3] @ expected[:, :3].T)
         turned = f", and turned by {np.degrees(turned_rad):.0f}°" if turned_rad > TURNED_RAD else ""
-        where = f"{off:.2g} {self.judged.unit} from where it is found{turned}"
+        where = f"{self.judged.length(off)} from where it is found{turned}"
         return f"{_TOGETHER} {self.partners[other]}, it should be {where}."
 
     def _decide(self, first: str, second: str) -> bool:

@@ -19,6 +19,7 @@ from spherloc.errors import InputError
 from spherloc.experiments.results import DOUBTFUL, FAILED, LOCALIZED, UNREADABLE, QueryResult
 from spherloc.files import is_file
 from spherloc.frontend.view import View
+from spherloc.metrics import said_length
 from spherloc_viz import style
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.touch import Touch, Touches
@@ -119,7 +120,7 @@ class QueryStrip:
         page = min(page, (len(views) - 1) // PAGE)
         shown = views[page * PAGE : (page + 1) * PAGE]
         pictures = {view.name: self._picture(view) for view in shown}
-        strip = Strip(shown, pictures, known, marked, "m" if scene.metric else "units")
+        strip = Strip(shown, pictures, known, marked, scene)
         untold = () if any(view.cam_from_map is not None for view in scene.queries) else ("error",)
         orders = {key: words for key, words in ORDERS.items() if key not in untold}
         self._show(strip_html(strip, orders, order, page, len(views)))
@@ -176,7 +177,8 @@ class Strip:
     """What became of the queries, by their names."""
     marked: str
     """The query that the page shows."""
-    unit: str
+    scene: MapScene
+    """Its map has the unit and the extent of errors."""
 
 
 def strip_html(strip: Strip, orders: Mapping[str, str], order: str, page: int, count: int) -> str:
@@ -210,7 +212,7 @@ def _cell(view: View, strip: Strip) -> str:
             f'<span aria-hidden="true" style="position:absolute;right:0;bottom:0;padding:0 .3em;color:#fff;'
             f'background:rgba(20,24,32,.75);font-weight:700">{sign}</span>'
         )
-    said, width_px = said_of(view.name, row, strip.unit), width_of(view.camera)
+    said, width_px = said_of(view.name, row, strip.scene), width_of(view.camera)
     current, weight = (' aria-current="true"', "font-weight:700") if view.name == strip.marked else ("", DIM)
     image = (
         f'<img alt="" src="{picture}" style="display:block;height:{HEIGHT_PX}px">'
@@ -242,7 +244,7 @@ def end_of(name: str, width_px: int) -> str:
     return stem if len(stem) <= room else f"…{stem[1 - room :]}"
 
 
-def said_of(name: str, row: QueryResult | None, unit: str) -> str:
+def said_of(name: str, row: QueryResult | None, scene: MapScene) -> str:
     """A query's name and what became of it, in a line, and what other queries or maps say against its pose."""
     if row is None:
         return name
@@ -250,5 +252,8 @@ def said_of(name: str, row: QueryResult | None, unit: str) -> str:
     if row.inliers is not None and row.matches:
         parts.append(f"{row.inliers} of {row.matches} matches")
     if row.translation_error_m is not None and row.rotation_error_deg is not None:
-        parts.append(f"{row.translation_error_m:.2g} {unit}, {row.rotation_error_deg:.2g}° off")
+        error = f"{row.translation_error_m:.2g} {'m' if scene.metric else 'units'}"
+        parts.append(
+            f"{said_length(row.translation_error_m, scene.extent_m, error)}, {row.rotation_error_deg:.2g}° off"
+        )
     return ". ".join((", ".join(parts), *row.doubts))
