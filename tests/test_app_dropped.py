@@ -3,6 +3,9 @@
 import asyncio
 import errno
 import io
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -46,6 +49,38 @@ def drop(home: Path) -> Iterator[Drop]:
     made = Drop(home)
     yield made
     made.close()
+
+
+@pytest.mark.parametrize("by", ["the next drop", "the next start"])
+def test_what_a_killed_playground_left_goes(by: str, home: Path, tmp_path: Path) -> None:
+    """Folders of others, of living processes and behind links stay."""
+    kill_in_a_drop = (
+        "import os, signal, sys; from pathlib import Path; from spherloc_viz.app.panels.dropped import DroppedFiles;"
+        "drop = DroppedFiles(lambda: (lambda: Path(sys.argv[1]),), print); drop.begin('rooms', 2, 10);"
+        "drop.open('a.jpg').write(b'half'); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    assert subprocess.run([sys.executable, "-c", kill_in_a_drop, home], check=False).returncode == -signal.SIGKILL
+    (left,) = home.iterdir()
+    assert (left / "a.jpg").read_bytes() == b"half"
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "kept.jpg").touch()
+    (left / "link").symlink_to(outside)
+    link = home / f"{left.name[:-1]}{'1' if left.name[-1] == '0' else '0'}"
+    link.symlink_to(outside)
+    others = {link, home / ".dropped-notes", home / f".dropped-{'0' * 16}"}
+    for other in others - {link}:
+        other.mkdir()
+    drop = Drop(home)
+    if by == "the next drop":
+        drop.begin("street", 1, 10)
+    else:
+        DropRoom(home)
+    assert not left.exists() and (outside / "kept.jpg").exists() and others <= set(home.iterdir())
+    alive = set(home.iterdir())
+    DropRoom(home)
+    assert set(home.iterdir()) == alive, "that of a living process stays"
+    drop.close()
 
 
 @pytest.mark.parametrize(

@@ -2,14 +2,14 @@
 
 What a page sends is untrusted. It is limited in number and size, and written nowhere but into that folder. Names are
 checked, and are of files with the endings of photographs and of what may lie beside them. While files arrive, the
-folder is hidden; it gets its name when all are there, and is removed if anything fails.
+folder is hidden; it gets its name when all are there, and is removed if anything fails, or by the next playground if
+this one is killed.
 """
 
 import contextlib
 import json
 import os
 import re
-import secrets
 import shutil
 import threading
 from collections.abc import Callable
@@ -24,6 +24,7 @@ from spherloc.mapping.images.found_calibrations import CALIBRATIONS
 from spherloc.mapping.images.left_out import UNREAD
 from spherloc.mapping.scenes.scene_files import MAP_FOLDER
 from spherloc_viz.app.web.drops import Arriving, NotTakenError
+from spherloc_viz.recording.storage.unfinished import remove_abandoned_folders, unfinished_folder
 
 BESIDE = (*CALIBRATIONS, ".csv")
 """Endings of the files beside photographs that are kept: calibrations, positions and gravity."""
@@ -80,7 +81,9 @@ class DroppedFiles:
         wrong: OSError | None = None
         for home in self._homes():
             try:
-                folder = home() / f".dropped-{secrets.token_hex(8)}"
+                place = home()
+                remove_abandoned_folders(place)
+                folder = unfinished_folder(place)
                 folder.mkdir()
                 free = shutil.disk_usage(folder).free
             except OSError as error:

@@ -14,6 +14,7 @@ from aiohttp import web
 
 from spherloc.errors import InputError
 from spherloc_viz.app.web.access import SAFE
+from spherloc_viz.recording.storage.unfinished import remove_abandoned_folders
 
 DROPS = "/drop/"
 PIECE_BYTES = 1 << 20
@@ -58,7 +59,10 @@ class DropRoom:
     """All pages onto which photographs can be dropped. Thread-safe."""
 
     def __init__(self, kept_in: Path | None = None) -> None:
-        """``kept_in`` is the folder in which they are kept; None if they go with their page."""
+        """``kept_in`` is the folder in which they are kept, from which goes what killed playgrounds left half; None if
+        they go with their page."""
+        if kept_in is not None:
+            remove_abandoned_folders(kept_in)
         self.kept_in = kept_in
         self._lock = threading.Lock()
         self._pages: dict[str, Receiver] = {}

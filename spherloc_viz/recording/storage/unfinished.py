@@ -1,10 +1,12 @@
-"""Unfinished files: their names tell which process writes them; those of a killed one are recovered or deleted."""
+"""Unfinished files and folders: their names tell which process writes them; those of a killed one are recovered or
+deleted."""
 
 import contextlib
 import hashlib
 import os
 import re
 import secrets
+import shutil
 import socket
 import time
 from functools import cache, lru_cache
@@ -15,6 +17,7 @@ STALE_AFTER_S = 600.0
 
 _OWNER = r"(?P<machine>[0-9a-f]{8})-(?P<boot>[0-9a-f]{8})-(?P<pid>\d{1,10})-(?P<start>\d{1,20})-"
 _PART = re.compile(rf"(?P<name>.+\.rrd)\.(?:{_OWNER})?[0-9a-f]{{8}}\.part")
+_FOLDER = re.compile(rf"\.dropped-{_OWNER}[0-9a-f]{{16}}")
 
 
 def unfinished(path: Path) -> Path:
@@ -46,6 +49,24 @@ def leftovers(folder: Path) -> list[Path]:
                     if not alive:
                         found.append(Path(entry.path))
     return sorted(found)
+
+
+def unfinished_folder(home: Path) -> Path:
+    """A hidden folder in ``home``, not made yet, in which this process gathers files; new in every call."""
+    return home / f".dropped-{_owner()}-{secrets.token_hex(8)}"
+
+
+def remove_abandoned_folders(home: Path) -> None:
+    """Remove the folders named by ``unfinished_folder`` in ``home`` that are this user's and whose process has ended on
+    this machine. Links, and folders whose process cannot be asked, stay; so does what cannot be removed."""
+    with contextlib.suppress(OSError), os.scandir(home) as entries:
+        for entry in entries:
+            match = _FOLDER.fullmatch(entry.name)
+            if match is None or not entry.is_dir(follow_symlinks=False):
+                continue
+            own = os.name == "nt" or entry.stat(follow_symlinks=False).st_uid == os.getuid()
+            if own and _alive(match) is False:
+                shutil.rmtree(entry.path, ignore_errors=True)
 
 
 def _owner() -> str:
