@@ -208,6 +208,17 @@ def test_one_drop_and_one_file_at_a_time(drop: Drop, home: Path) -> None:
         drop.begin("rooms", 1, 5)
 
 
+def test_what_breaks_off_late_takes_nothing_of_the_next_drop(drop: Drop, home: Path) -> None:
+    """The server may hear only then that the page gave up a file."""
+    drop.begin("rooms", 1, 5)
+    late = drop.open("a.jpg")
+    drop.begin("street", 1, 5)
+    late.break_off()
+    drop.send("b.jpg")
+    drop.open("c.jpg").break_off()
+    assert not list(home.iterdir()), "one of its own does"
+
+
 def test_a_full_disk_leaves_nothing(drop: Drop, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(dropped_module.shutil, "disk_usage", lambda path: SimpleNamespace(free=2_000_000))

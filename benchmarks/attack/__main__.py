@@ -47,7 +47,10 @@ def main() -> int:
     words.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) // 2))
     words.add_argument("--kind", action="append", choices=list(KINDS), help="one or more; all if not given")
     words.add_argument(
-        "--requests", type=int, default=300, help="to the page, and so many messages through its websocket"
+        "--requests",
+        type=int,
+        default=300,
+        help="to the page, to its address for drops, and so many messages through its websocket",
     )
     words.add_argument("--again", nargs=2, metavar=("KIND", "NUMBER"))
     given = words.parse_args()

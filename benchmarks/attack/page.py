@@ -7,7 +7,10 @@ import re
 import subprocess
 import tempfile
 import time
-from typing import Any
+from contextlib import AbstractContextManager
+from functools import partial
+from pathlib import Path
+from typing import IO, Any
 from urllib.parse import urlsplit
 
 import aiohttp
@@ -15,11 +18,13 @@ import msgspec
 import numpy as np
 
 from benchmarks.attack.damage import damaged
+from benchmarks.attack.drops import attack_drops
 from benchmarks.attack.files import Tally
 from benchmarks.page_client import HELLO, PageClient
 from benchmarks.playground import SCENE, memory_mib, playground
 
 REQUESTS, PRESSES, MESSAGES = ("requests without the token", "requests with it"), "presses", "websocket messages"
+DROPPED = "dropped photographs"
 CONTINUE = 100
 """The status that says no more than that the request may go on."""
 ANSWER_S = 2.0
@@ -53,10 +58,15 @@ VALUES: tuple[Any, ...] = (
 
 
 def attack_page(count: int, seed: int) -> dict[str, Tally]:
-    """So many requests without a token, with one, presses, and messages through the websocket; what came of each."""
-    tallies = {name: Tally() for name in (*REQUESTS, PRESSES, MESSAGES)}
-    with tempfile.TemporaryFile("w+") as errors, playground(SCENE, None, "--token", errors=errors) as (link, server):
-        asyncio.run(_attack(link, server, tallies, count, np.random.default_rng([seed, 1])))
+    """So many requests without a token, with one, to the address of dropped photographs, presses, and messages through
+    the websocket; what came of each."""
+    tallies = {name: Tally() for name in (*REQUESTS, DROPPED, PRESSES, MESSAGES)}
+    with (
+        tempfile.TemporaryFile("w+") as errors,
+        tempfile.TemporaryDirectory() as place,
+        _served(Path(place) / "kept", errors) as (link, server),
+    ):
+        asyncio.run(_attack(link, server, tallies, (count, Path(place) / "kept"), np.random.default_rng([seed, 1])))
         memory_mb = memory_mib(server.pid)
         errors.seek(0)
         printed = errors.read()
@@ -66,9 +76,21 @@ def attack_page(count: int, seed: int) -> dict[str, Tally]:
     return tallies
 
 
+def _served(kept: Path, errors: IO[str]) -> AbstractContextManager[tuple[str, subprocess.Popen[str]]]:
+    """The link to a playground, and its process, which keeps what is dropped in the new folder ``kept``."""
+    kept.mkdir()
+    return playground(SCENE, None, "--token", "--allow", str(kept), errors=errors)
+
+
 async def _attack(
-    link: str, server: subprocess.Popen[str], tallies: dict[str, Tally], count: int, rng: np.random.Generator
+    link: str,
+    server: subprocess.Popen[str],
+    tallies: dict[str, Tally],
+    much: tuple[int, Path],
+    rng: np.random.Generator,
 ) -> None:
+    """``much`` is the number of attacks of each kind, and the folder in which dropped photographs are kept."""
+    count, kept = much
     parts = urlsplit(link)
     port = parts.port or 0
     cookie = await _cookie(link)
@@ -82,6 +104,13 @@ async def _attack(
             _note(tallies[name], number, outcome, time.perf_counter() - start, server, f"status {status}")
     await _press(f"http://{parts.netloc}/", cookie, server, tallies[PRESSES], count, rng)
     await _talk(f"http://{parts.netloc}/", cookie, server, tallies[MESSAGES], count, rng)
+    async with PageClient(f"http://{parts.netloc}/", cookie=cookie) as page:
+        await page.until(lambda: page.says("data-drops"), 120.0)
+        to = port, cookie, partial(_request, port)
+        number = 0
+        async for outcome, seconds, what in attack_drops(page, to, kept, count, rng):
+            _note(tallies[DROPPED], number, outcome, seconds, server, what)
+            number += 1
 
 
 def _note(tally: Tally, number: int, outcome: str, seconds: float, server: subprocess.Popen[str], wrong: str) -> None:

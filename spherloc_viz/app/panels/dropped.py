@@ -184,6 +184,12 @@ class DroppedFiles:
                 self._remove()
                 raise _not_written(arriving.path, error) from None
 
+    def broken_off(self, arriving: "_ArrivingFile") -> None:
+        """A file will not be whole: as ``cancel``, unless other files have been begun since."""
+        with self._lock:
+            if self._arriving is arriving:
+                self._remove()
+
     def arrived(self, arriving: "_ArrivingFile") -> None:
         """A file is there as a whole."""
         with self._lock:
@@ -207,6 +213,10 @@ class _ArrivingFile:
     def close(self) -> None:
         """All of it is there, or no more will come."""
         self._drop.arrived(self)
+
+    def break_off(self) -> None:
+        """It broke off on its way."""
+        self._drop.broken_off(self)
 
 
 def _not_written(path: Path, error: OSError) -> InputError:

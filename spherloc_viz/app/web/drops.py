@@ -36,6 +36,9 @@ class Arriving(Protocol):
     def close(self) -> None:
         """No more pieces come."""
 
+    def break_off(self) -> None:
+        """It is not whole, so nothing is kept of what was dropped with it; what was dropped since stays."""
+
 
 class Receiver(Protocol):
     """One page's keeper of what is dropped onto it. Whatever is refused raises ``InputError``, a file that is left out
@@ -121,7 +124,7 @@ async def _receive(page: Receiver, name: str, request: web.Request) -> None:
     except (web.RequestPayloadError, ConnectionError):
         raise InputError("a file broke off on its way, so none was kept; drop the photographs again.") from None
     finally:
-        await asyncio.to_thread(file.close if whole else page.cancel)
+        await asyncio.to_thread(file.close if whole else file.break_off)
 
 
 def _whole(digits: str) -> int:
