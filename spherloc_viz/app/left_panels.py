@@ -163,6 +163,11 @@ class LeftPanels:
         self._opening = label
         self._changed(None)
 
+    @property
+    def opens_another(self) -> bool:
+        """Whether another scene than that of the run that was drawn last is being opened."""
+        return bool(self._opening)
+
     def tell_opening(self, words: str, share: float | None) -> None:
         """Show the progress of the opening, 0 to 1, or None where it is not known."""
         if self._opening:

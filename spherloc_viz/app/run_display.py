@@ -250,7 +250,7 @@ class RunDisplay:
             self.panels.diagnose(*("", "") if hidden else _diagnosed_html(trace, diagnosis, index))
             right = partial(self.canvas.card_is_right, drawn)
             # While another scene opens, matches of the one before are not offered for change.
-            carded = () if self._map is not None else selected
+            carded = () if self.panels.opens_another else selected
             self.card.draw(trace, carded, run.kept, alternative, right, not told)
         nearest = sorted(range(len(timeline)), key=lambda other: (abs(other - index), index - other))
         self._to_prepare = deque(
