@@ -46,14 +46,14 @@ def load_camera(path: str | Path, name: str | None = None, size: tuple[int, int]
 
     The kind is recognised by the content: a KITTI-360 YAML (``model_type: MEI``), a Kalibr camchain (``cam0``, ...:
     pinhole or omni with radtan, equidistant or none, ds, eucm), the YAML of stella_vslam (``Camera``), 360Loc
-    (``imgw``) and fisheye-calib-adapter (``parameter``), that of ROS and the YAML, XML or JSON of OpenCV's samples
-    and of scripts (``distortion_coefficients``, ``D`` and other names), a Basalt JSON (``value0``), a JSON of cameras
-    by name (``model``, ``params``), nerfstudio's ``transforms.json`` (``fl_x``), a JSON of WoodScape
-    (``intrinsic``), COLMAP's ``cameras.txt``, OCamCalib's ``calib_results.txt`` and a TOML with a ``[camera]`` table or
-    with its keys at the top. ``name`` picks one of ``camera_names``, by default the first one. ``size`` is that of the
-    images, px, for a file of OpenCV that does not state it. Principal points that count from the centre of the top-left
-    pixel are moved by +0.5 pixels to this project's convention (that centre is (0.5, 0.5)). A file of another kind is
-    given to the readers of extensions (docs/extending.md).
+    (``imgw``) and fisheye-calib-adapter (``parameter``), that of ROS and the YAML, XML or JSON of OpenCV's samples and
+    of scripts (``distortion_coefficients``, ``D`` and other names), a Basalt JSON (``value0``), a JSON of cameras by
+    name (``model``, ``params``), nerfstudio's ``transforms.json`` (``fl_x``), a JSON of WoodScape (``intrinsic``),
+    COLMAP's ``cameras.txt``, OCamCalib's ``calib_results.txt`` and a TOML or JSON with a ``[camera]`` table or with its
+    keys at the top. ``name`` picks one of ``camera_names``, by default the first one. ``size`` is that of the images,
+    px, for a file of OpenCV that does not state it. Principal points that count from the centre of the top-left pixel
+    are moved by +0.5 pixels to this project's convention (that centre is (0.5, 0.5)). A file of another kind is given
+    to the readers of extensions (docs/extending.md).
 
     Raises ``CalibrationError``, naming the file and the place, for whatever cannot be read as a usable camera.
     """
@@ -153,6 +153,14 @@ def _from_json(document: Any, name: str | None, size: tuple[int, int] | None) ->
     if json_files.is_transforms(document):
         _refuse_name(name)
         return json_files.transforms(document)
+    table = json_files.own_table(document)
+    if table is not None:
+        _refuse_name(name)
+        where = "top level" if table is document else "camera"
+        if "params" in table:
+            with located(where):
+                return json_files.camera_of_table(table)
+        return camera_from_table(table, where)
     return _one_camera(document, name, "JSON", size)
 
 

@@ -7,6 +7,7 @@ at (0, 0), so that 0.5 is added to its principal points.
 
 from typing import Any
 
+from spherloc import registry
 from spherloc.cameras._checks import located
 from spherloc.cameras._files import PIXEL_CENTRE_SHIFT, list_of, numbers_of, size_of, table_of, value_of
 from spherloc.cameras.base import Camera
@@ -18,6 +19,14 @@ from spherloc.errors import CalibrationError, show
 ARIA = ("FISHEYE624", "FisheyeRadTanThinPrism")
 _ARIA_NAMES = "f, cx, cy, k0, k1, k2, k3, k4, k5, p0, p1, s0, s1, s2, s3"
 _PANORAMA = "EQUIRECTANGULAR"
+_ORDERED = {
+    "fisheye624": "RAD_TAN_THIN_PRISM_FISHEYE if they are COLMAP's 16, or FISHEYE624 if they are Project Aria's 15, "
+    "which count pixels from the centre of the top-left one",
+    "kannala_brandt": "OPENCV_FISHEYE if they are COLMAP's 8",
+    "eucm": "EUCM if they are COLMAP's 6",
+    "equirectangular": "EQUIRECTANGULAR if they are COLMAP's 2",
+}
+"""What models of this project are called where their numbers are a list, in whose order."""
 _COEFFICIENTS = {
     "SIMPLE_PINHOLE": (),
     "PINHOLE": (),
@@ -40,6 +49,20 @@ def is_transforms(document: Any) -> bool:
     return isinstance(document, dict) and ("fl_x" in document or document.get("camera_model") == _PANORAMA)
 
 
+def is_own_model(model: Any) -> bool:
+    """Whether a model is called as this project, or an extension, calls it in a ``[camera]`` table."""
+    return isinstance(model, str) and model in registry.names("cameras")
+
+
+def own_table(document: Any) -> dict[Any, Any] | None:
+    """The table of a JSON that is a ``[camera]`` table, at its top or as ``camera``, with a model of this project; None
+    for another JSON."""
+    if not isinstance(document, dict):
+        return None
+    table = document.get("camera", document)
+    return table if isinstance(table, dict) and is_own_model(table.get("model")) else None
+
+
 def camera_of_table(table: dict[Any, Any]) -> Camera:
     """The camera of a table with ``model``, the name of a model of COLMAP or of Project Aria, ``params`` in that
     model's order, and ``size``, or ``width`` and ``height``.
@@ -52,6 +75,12 @@ def camera_of_table(table: dict[Any, Any]) -> Camera:
     if model in ARIA:
         f, cx, cy, *lens = list_of(table, "params", _ARIA_NAMES)
         return Fisheye624(width, height, f, f, cx + PIXEL_CENTRE_SHIFT, cy + PIXEL_CENTRE_SHIFT, tuple(lens))
+    if is_own_model(model):
+        called = f"call it {_ORDERED[model]}, or " if model in _ORDERED else ""
+        raise CalibrationError(
+            f"model {show(model)} does not say in which order the numbers in 'params' are: {called}give each by its "
+            "key, as in the [camera] table of a scene file."
+        )
     if not isinstance(params, list):
         raise CalibrationError(f"key 'params' is {show(params)}: give a list of numbers.")
     return camera_from_colmap(model, width, height, params, f"model {show(model)}")

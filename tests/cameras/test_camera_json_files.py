@@ -9,6 +9,7 @@ from camera_samples import random_directions, require_shared
 
 from spherloc.cameras.calibration import camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
+from spherloc.cameras.fisheye624 import Fisheye624
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.errors import CalibrationError
 
@@ -79,6 +80,15 @@ def test_a_panorama_and_one_focal_length_in_transforms_json(tmp_path):
     )
 
 
+def test_a_camera_table_of_this_project_as_json(tmp_path):
+    lens = (0.02, -0.01, *[0.0] * 10)
+    table = {"width": 640, "height": 480, "fx": 200, "fy": 201, "cx": 320, "cy": 240, "distortion": lens}
+    camera = Fisheye624(640, 480, 200, 201, 320, 240, lens)
+    for document in ({"model": "fisheye624", **table}, {"camera": {"model": "fisheye624", **table}}):
+        assert load_camera(written(tmp_path, document)) == camera, "its principal point is taken as it is"
+    assert camera_names(tmp_path / "lens.json") == ()
+
+
 @pytest.mark.parametrize(
     ("document", "said"),
     [
@@ -90,6 +100,18 @@ def test_a_panorama_and_one_focal_length_in_transforms_json(tmp_path):
             {"left": {"model": "FISHEYE624", "size": [64, 48], "params": [1.0]}},
             "left.*list of 15 finite numbers",
         ),
+        (
+            {"left": {"model": "fisheye624", "size": [64, 48], "params": [1.0] * 16}},
+            "left.*model 'fisheye624' does not say in which order .*: call it RAD_TAN_THIN_PRISM_FISHEYE if .*16, or "
+            "FISHEYE624 if they are Project Aria's 15",
+        ),
+        ({**TABLE, "model": "kannala_brandt"}, "top level: model 'kannala_brandt' .* call it OPENCV_FISHEYE if"),
+        (
+            {**TABLE, "model": "mei"},
+            "model 'mei' does not say in which order the numbers in 'params' are: give each by",
+        ),
+        ({"model": "mei", "width": 64}, "top level: .*key 'height' is missing"),
+        ({"model": "RICOH THETA", "params": 1}, "this JSON has no known key at its top"),
         ({"left": {"model": "OPENCV", "params": []}}, "left.*key 'width' is missing"),
         ({**FISHEYE, "camera_model": "SPHERICAL"}, "camera_model 'SPHERICAL' is not supported"),
         ({**FISHEYE, "fl_x": "wide"}, "fl_x"),
