@@ -1,8 +1,12 @@
 """What a 360-degree camera writes into its photographs: pitch and roll, and that they are panoramas, in an XMP packet
 after Google's Photo Sphere metadata (https://developers.google.com/streetview/spherical-metadata)."""
 
+import struct
 import warnings
+import zlib
+from collections.abc import Sequence
 from pathlib import Path
+from typing import BinaryIO
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,6 +20,11 @@ from spherloc.types import FloatArray
 
 SOURCE = "pitch and roll in the photograph's tags"
 MAX_BYTES = 1_000_000
+_MAX_CHUNKS = 100_000
+_PNG_KEY = "XML:com.adobe.xmp"
+_EXTENSION = b"http://ns.adobe.com/xmp/extension/\0"
+"""What a segment of a JPEG begins with that has a piece of an extended packet; the packet's name, 32 digits, follows,
+then the length of the whole packet and the piece's place in it."""
 _GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
 _PITCH, _ROLL = "PosePitchDegrees", "PoseRollDegrees"
 _LIMITS_DEG = {_PITCH: 90.0, _ROLL: 360.0}
@@ -28,10 +37,10 @@ def gravity_from_tags(view: View, near: FloatArray | None = None) -> Gravity:
     Raises ``InputError`` if the image cannot be read, or if its tags hold no pitch and roll or no valid angle.
     """
     place = shorten(view.name)
-    packet = _packet(view.path)
-    if packet is None:
+    packets = _packets(view.path)
+    if not packets:
         raise InputError(f"{place}: has no XMP tags, which would hold its pitch and roll.")
-    pitch_deg, roll_deg = _pitch_and_roll(packet, place)
+    pitch_deg, roll_deg = _pitch_and_roll(packets, place)
     return Gravity(down_of(np.radians(pitch_deg), np.radians(roll_deg)), SOURCE)
 
 
@@ -44,16 +53,64 @@ def down_of(pitch_rad: float, roll_rad: float) -> FloatArray:
     return np.array([level * np.sin(roll_rad), level * np.cos(roll_rad), -np.sin(pitch_rad)])
 
 
-def _packet(path: Path) -> bytes | None:
-    """The XMP packet of an image; None if it has none."""
+def _packets(path: Path) -> list[bytes]:
+    """The XMP packet of an image, and the one that extends it if its JPEG has one; none if it has no packet."""
     with reading(path, "correct the path of the image"), open_file(path) as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             with Image.open(file) as image:
-                packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp")
+                packet = image.info.get("xmp") or image.info.get(_PNG_KEY)
+                segments = getattr(image, "applist", ())
+                if not packet and image.format == "PNG":
+                    packet = _late_packet(file)
         except (Image.UnidentifiedImageError, Image.DecompressionBombError, SyntaxError, ValueError):
             raise InputError(f"{path}: is not an image that can be read; give another one.") from None
-    return packet.encode() if isinstance(packet, str) else packet
+    if not packet:
+        return []
+    main = packet.encode() if isinstance(packet, str) else packet
+    extended = _extended(main, [data for name, data in segments if name == "APP1"])
+    return [main] if extended is None else [main, extended]
+
+
+def _late_packet(file: BinaryIO) -> bytes | None:
+    """The XMP packet of a PNG that has it after its pixels, as ExifTool writes it, without decoding these."""
+    file.seek(8)
+    for _ in range(_MAX_CHUNKS):
+        length, kind = struct.unpack(">I4s", file.read(8).ljust(8, b"\0"))
+        if kind in (b"IEND", b"\0\0\0\0"):
+            return None
+        if kind != b"iTXt" or length > MAX_BYTES:
+            file.seek(length + 4, 1)
+            continue
+        key, _, rest = file.read(length).partition(b"\0")
+        file.seek(4, 1)
+        if key == _PNG_KEY.encode() and len(rest) > 1:
+            text = rest[2:].split(b"\0", 2)[-1]  # after a language and a translated key
+            return text if rest[0] == 0 else _inflated(text)
+    return None
+
+
+def _inflated(text: bytes) -> bytes:
+    """The text, of which no more is read than a packet may have; empty if it is damaged."""
+    try:
+        return zlib.decompressobj().decompress(text, MAX_BYTES + 1)
+    except zlib.error:
+        return b""
+
+
+def _extended(main: bytes, segments: Sequence[bytes]) -> bytes | None:
+    """The packet that extends the ``main`` one, in pieces in segments of a JPEG (XMP specification, part 3); None if
+    there is none, or if it is not there as a whole."""
+    pieces: dict[int, bytes] = {}
+    whole = 0
+    for data in segments:
+        if data.startswith(_EXTENSION) and len(data) >= len(_EXTENSION) + 40:
+            name, place = data[len(_EXTENSION) :][:32], data[len(_EXTENSION) + 32 :]
+            if name in main:
+                whole, start = struct.unpack(">II", place[:8])
+                pieces[start] = place[8:]
+    packet = b"".join(piece for _, piece in sorted(pieces.items()))
+    return packet if packet and len(packet) == whole else None
 
 
 def says_full_panorama(path: Path) -> bool:
@@ -61,8 +118,7 @@ def says_full_panorama(path: Path) -> bool:
 
     Raises ``InputError`` if it cannot be read.
     """
-    packet = _packet(path)
-    root = None if packet is None else _parsed(packet)
+    root = _root(_packets(path))
     if root is None or _value(root, "ProjectionType") != "equirectangular":
         return False
     cropped, full = (
@@ -73,6 +129,16 @@ def says_full_panorama(path: Path) -> bool:
         )
     )
     return cropped == full or None in (*cropped, *full)
+
+
+def _root(packets: Sequence[bytes]) -> ElementTree.Element | None:
+    """An element with all that the packets say; None if there is none, or if the first one is damaged."""
+    roots = [_parsed(packet) for packet in packets]
+    if not roots or roots[0] is None:
+        return None
+    both = ElementTree.Element("both")
+    both.extend([root for root in roots if root is not None])
+    return both
 
 
 def _parsed(packet: bytes) -> ElementTree.Element | None:
@@ -96,9 +162,9 @@ def _value(root: ElementTree.Element, name: str) -> str | None:
     return found
 
 
-def _pitch_and_roll(packet: bytes, place: str) -> tuple[float, float]:
+def _pitch_and_roll(packets: Sequence[bytes], place: str) -> tuple[float, float]:
     """Pitch and roll, degrees; one of them is enough: cameras leave out an angle of 0."""
-    root = _parsed(packet)
+    root = _root(packets)
     if root is None:
         raise InputError(f"{place}: its XMP tags are damaged, so that its pitch and roll cannot be read.")
     found: dict[str, float] = {}

@@ -1,5 +1,8 @@
 """Pitch and roll of 360-degree cameras: which way is down, and packets that are not what they should be."""
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -72,6 +75,47 @@ def test_both_ways_of_writing_them_are_read(tmp_path, packet, suffix):
     found = gravity_from_tags(view(tmp_path, packet, suffix))
     np.testing.assert_allclose(found.down, [0.0347919, 0.9963101, 0.0784591], atol=1e-7)  # a little right and ahead
     assert found.source == "pitch and roll in the photograph's tags"
+
+
+@pytest.mark.parametrize("squeezed", [False, True])
+@pytest.mark.parametrize("packet", [ATTRIBUTES, ELEMENTS], ids=["attributes", "elements"])
+def test_a_packet_behind_the_pixels_of_a_png_is_read(tmp_path, packet, squeezed):
+    """ExifTool writes it there."""
+    plain = view(tmp_path, None, "png")
+    text = zlib.compress(packet.encode()) if squeezed else packet.encode()
+    data = plain.path.read_bytes()
+    other = chunk(b"iTXt", b"Title\0\0\0\0\0A room")
+    late = chunk(b"iTXt", b"XML:com.adobe.xmp\0" + bytes([squeezed, 0]) + b"\0\0" + text)
+    plain.path.write_bytes(data[:-12] + other + late + data[-12:])
+    np.testing.assert_allclose(gravity_from_tags(plain).down, [0.0347919, 0.9963101, 0.0784591], atol=1e-7)
+    plain.path.write_bytes(data[:-12] + other + late[: len(late) // 2])
+    with pytest.raises(InputError, match="XMP tags"):
+        gravity_from_tags(plain)
+
+
+def chunk(kind, content):
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def test_a_packet_in_further_segments_of_a_jpeg_is_read(tmp_path):
+    """What does not fit into a segment of 64 kB is extended; a piece of it that is missing leaves the rest."""
+    name = b"0123456789ABCDEF0123456789ABCDEF"
+    main = attributes(f'xmlns:xmpNote="http://ns.adobe.com/xmp/note/" xmpNote:HasExtendedXMP="{name.decode()}"')
+    photograph = view(tmp_path, main)
+    data, extended = photograph.path.read_bytes(), ELEMENTS.replace("<GPano", f"{' ' * 70_000}<GPano", 1).encode()
+
+    def write(named, *places):
+        key = b"http://ns.adobe.com/xmp/extension/\0" + named + struct.pack(">I", len(extended))
+        bodies = [key + struct.pack(">I", start) + extended[start : start + 60_000] for start in places]
+        segments = [b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body for body in bodies]
+        photograph.path.write_bytes(data[:2] + b"".join(segments) + data[2:])
+
+    write(name, 60_000, 0)
+    np.testing.assert_allclose(gravity_from_tags(photograph).down, [0.0347919, 0.9963101, 0.0784591], atol=1e-7)
+    for wrong in ((name, 0), (name[::-1], 0, 60_000)):
+        write(*wrong)
+        with pytest.raises(InputError, match="hold no pitch and roll"):
+            gravity_from_tags(photograph)
 
 
 def test_a_packet_that_ends_with_zeros_and_an_angle_beyond_180_degrees_are_read(tmp_path):
