@@ -22,6 +22,7 @@ from spherloc.mapping.models.model import Reconstruction
 from spherloc.mapping.models.reconstruction import reconstruct
 from spherloc.mapping.parallel import Tell
 from spherloc.mapping.request import MapRequest
+from spherloc.mapping.two_view.matched import DATABASES, files_of
 
 MOVED_RAD, DOUBT_RAD = radians(0.5), radians(1.0)
 """A map is made anew with a lens that it fits better if directions differ by the first angle, and the lens is in doubt
@@ -76,6 +77,8 @@ class CheckedModels:
     """See ``Map``."""
     doubts: tuple[str, ...] = ()
     """A sentence on the lens, if it is in doubt."""
+    unused: tuple[Path, ...] = ()
+    """Files with the matches of models that were not taken, which nothing reads once the map with its lens is there."""
 
 
 def checked_models(folder: Path, request: MapRequest, tell: Tell) -> CheckedModels:
@@ -108,15 +111,19 @@ def _with_lens_of_map(
     if found is not None and found.moved_rad > max(MOVED_RAD, found.bound_rad):
         better = lens._replace(camera=found.camera, how=f"{lens.how} {CORRECTED.format(degrees(found.moved_rad))}")
         request = before.request.with_lens(lens, better)
+        known = set(folder.glob(DATABASES))
         try:
             anew = _built(folder, request, tell)
             again = lens_in_map(anew.models[0], tell)
             if again is not None and _images(anew) >= _images(before.built):
-                checked, found = CheckedModels(request, anew, found.moved_rad), again
+                unused = files_of(before.built.models[0].database)
+                checked, found = CheckedModels(request, anew, found.moved_rad, unused=unused), again
         except StoppedError:
             raise
         except InputError:  # there is no map with that lens
             pass
+        if checked is before:
+            checked = replace(before, unused=tuple(sorted(set(folder.glob(DATABASES)) - known)))
     if found is None:
         return checked, False
     off_rad = max(found.moved_rad, found.bound_rad)

@@ -199,6 +199,8 @@ def _map_in(folder: Path, request: MapRequest, tell: Tell) -> Map:
         group, level, scale = found
         own = write_map(*found, views, request.images, place, request.new_images, kept)
         groups.append(replace(made, made=group, level=level, scale=scale, written=own))
+    for path in checked.unused:
+        path.unlink(missing_ok=True)
     return replace(made, groups=tuple(groups), opposed=_opposed(made, groups, shots_of(views)))
 
 

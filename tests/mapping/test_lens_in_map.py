@@ -145,17 +145,27 @@ def checked(monkeypatch, tmp_path):
     """What is made of a map with the lens ``WRONG`` of which lenses are said, one after another; ``anew`` is the number
     of images of the map that is made anew, None if it cannot be made."""
 
+    def matches(name: str) -> Path:
+        paths = [tmp_path / f"matches_{name}{end}.db" for end in ("", "_whole")]
+        for path in paths:
+            path.touch()
+        return paths[1]
+
     def of(*said: tuple[float, float] | None, anew: int | None = 8):
+        for left in tmp_path.glob("matches_*"):
+            left.unlink()
+        matches("of_other_settings")
         views = [View(f"{number}.png", WRONG, Path(f"{number}.png")) for number in range(8)]
         new = NewImages(tmp_path, (View("new.png", WRONG, Path("new.png")), View("other.png", TRUE, Path("other.png"))))
         request = MapRequest(views, tmp_path, new_images=new, lens=CalibratedLens(WRONG, "It was found."))
-        before = SimpleNamespace(models=[SimpleNamespace(poses=dict.fromkeys(range(8)))])
+        before = SimpleNamespace(models=[SimpleNamespace(poses=dict.fromkeys(range(8)), database=matches("a"))])
         answers = [None if one is None else LensInMap(TRUE, radians(one[0]), radians(one[1])) for one in said]
 
         def built(*_):
+            database = matches("b")
             if anew is None:
                 raise InputError("COLMAP could not start a map.")
-            return SimpleNamespace(models=[SimpleNamespace(poses=dict.fromkeys(range(anew)))])
+            return SimpleNamespace(models=[SimpleNamespace(poses=dict.fromkeys(range(anew)), database=database)])
 
         monkeypatch.setattr(checks, "lens_in_map", lambda *_: answers.pop(0))
         monkeypatch.setattr(checks, "_built", built)
@@ -179,10 +189,12 @@ def test_a_map_that_fits_another_lens_clearly_better_is_made_anew(checked):
     )
     assert {view.camera for view in found.request.views} == {TRUE}
     assert [view.camera for view in found.request.new_images.views] == [TRUE, TRUE]
+    assert [path.name for path in found.unused] == ["matches_a.db", "matches_a_whole.db"]
 
 
 def test_a_lens_that_fits_stays(checked):
     found, anew = checked((0.2, 0.02))
+    assert not found.unused
     assert not anew and not found.doubts and not found.corrected_rad and found.request.lens.camera == WRONG
     found, anew = checked(None)
     assert not anew and not found.doubts
@@ -201,6 +213,7 @@ def test_a_map_that_is_worse_with_the_other_lens_is_not_taken(checked, images):
     said = [(2.0, 0.02)] if images is None else [(2.0, 0.02), (0.1, 0.02)]
     found, anew = checked(*said, anew=images)
     assert not anew and found.request.lens.camera == WRONG and not found.corrected_rad
+    assert [path.name for path in found.unused] == ["matches_b.db", "matches_b_whole.db"]
     assert "2.0°" in found.doubts[0]
 
 

@@ -23,7 +23,7 @@ from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.datasets import bundled_scenes, load_scene
 from spherloc.datasets.query_gravity import read_gravity
-from spherloc.errors import InputError
+from spherloc.errors import InputError, StoppedError
 from spherloc.estimators import estimate
 from spherloc.formats.colmap_files import read_model
 from spherloc.frontend import trained
@@ -33,6 +33,7 @@ from spherloc.mapping.advice import COMMAND, PAGE, for_a_page
 from spherloc.mapping.alignment.line_gravity import gravity_by_lines
 from spherloc.mapping.alignment.stated_gravity import read_stated_gravity
 from spherloc.mapping.alignment.upright import Level, level_of, scale_by_height, upright_frame
+from spherloc.mapping.checked_models import checked_models
 from spherloc.mapping.images.photographs import photographs
 from spherloc.mapping.make import make_map, scale_of
 from spherloc.mapping.models.kept_models import FILE as KEPT_MODELS
@@ -307,6 +308,27 @@ def test_what_is_done_is_not_done_again(walk):
     for name, pose in made.written.poses.items():
         np.testing.assert_array_equal(repeated.written.poses[name], pose)
     np.testing.assert_array_equal(repeated.written.points, made.written.points)
+
+
+def test_matches_that_were_not_taken_go_once_the_map_is_there(walk, monkeypatch):
+    """As those of a first map whose lens was corrected: until then, a map that was stopped goes on from them."""
+    _, _, _, again, _, output = walk
+    unused = output / "matches_of_first.db"
+    unused.touch()
+
+    def checked(*given):
+        return replace(checked_models(*given), unused=(unused,))
+
+    def full(*given):
+        raise StoppedError("the disk is full; make room.")
+
+    monkeypatch.setattr("spherloc.mapping.make.checked_models", checked)
+    with monkeypatch.context() as patch, pytest.raises(StoppedError):
+        patch.setattr("spherloc.mapping.make.write_map", full)
+        again()
+    assert unused.exists()
+    again()
+    assert not unused.exists() and len(list(output.glob("matches_*_whole.db"))) == 1
 
 
 def test_models_are_kept_for_the_same_photographs_only(walk, tmp_path, monkeypatch):

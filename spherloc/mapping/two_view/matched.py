@@ -212,6 +212,12 @@ def _why_none(matched: Matched) -> str:
     )
 
 
+def files_of(database: Path) -> tuple[Path, ...]:
+    """The files in which ``match_all`` keeps what ``Matched.database`` has."""
+    stem = database.name.removesuffix("_whole.db")
+    return tuple(sorted(path for path in database.parent.glob(DATABASES) if path.name.startswith(stem)))
+
+
 @contextmanager
 def _database(pycolmap: Any, path: Path) -> Iterator[Any]:
     """COLMAP's database in a file, which is made if it is not there.
