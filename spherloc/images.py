@@ -64,14 +64,17 @@ def read_size(path: Path) -> tuple[int, int]:
         return _size(file, path)
 
 
-def is_turned(path: Path) -> bool:
-    """Whether a photograph has an orientation tag by which programs show it turned or mirrored; tags of PNGs, for which
-    all of it would be decoded, are not looked for."""
+def orientation_of(path: Path) -> int:
+    """The orientation tag of a photograph: by 2 to 8 programs show it turned or mirrored, from 5 on by a quarter turn.
+
+    1 without a valid tag; those of PNGs, for which all of it would be decoded, are not looked for.
+    """
     try:
         with warnings.catch_warnings(action="ignore"), open_file(path) as file, Image.open(file) as image:
-            return image.format != "PNG" and image.getexif().get(ORIENTATION, 1) in range(2, 9)
+            tag = 1 if image.format == "PNG" else image.getexif().get(ORIENTATION, 1)
+            return tag if tag in range(2, 9) else 1
     except Exception:  # Pillow passes on whatever a damaged tag raises
-        return False
+        return 1
 
 
 def check_image(path: Path) -> tuple[int, int]:

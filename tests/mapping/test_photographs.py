@@ -221,6 +221,25 @@ def test_panoramas_that_programs_show_turned_are_told(tmp_path, rng):
     assert remark.startswith("1 panorama has an orientation tag, which is not used: b.jpg; where pixels are upside")
 
 
+@pytest.mark.parametrize("panorama", [False, True])
+def test_panoramas_that_are_stored_on_their_side_are_told(panorama, tmp_path, rng):
+    def save(orientation):
+        tags = Image.Exif()
+        tags[0x0112] = orientation
+        for name in ("a.jpg", "b.jpg", "c.jpg"):
+            picture(tmp_path / name, 200, 400, rng)
+            with Image.open(tmp_path / name) as image:
+                image.save(tmp_path / name, exif=tags)
+
+    for orientation in (6, 8):
+        save(orientation)
+        with pytest.raises(InputError, match=r"3 of 200 x 400 pixels, are panoramas that are stored on their side"):
+            photographs(tmp_path, {}, panorama=panorama)
+    save(3)
+    with pytest.raises(InputError, match="no full panoramas" if panorama else "are not full panoramas"):
+        photographs(tmp_path, {}, panorama=panorama)
+
+
 def test_nothing_in_a_folder_of_a_stranger_is_left_out_in_silence(tmp_path, rng):
     """One whose end is missing has a sound header, and would otherwise end the work at the features."""
     for name in ("Büro am Fenster.JPG", "b.png", "cut.jpg"):

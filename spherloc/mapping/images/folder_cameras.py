@@ -13,7 +13,7 @@ from spherloc.cameras.principal_point import about_principal_point
 from spherloc.errors import InputError, shorten
 from spherloc.files import is_image
 from spherloc.frontend.view import View
-from spherloc.images import DamagedImageError, check_image, is_turned
+from spherloc.images import DamagedImageError, check_image, orientation_of
 from spherloc.mapping.advice import advice
 from spherloc.mapping.images.found_calibrations import FoundCalibrations
 from spherloc.mapping.images.frames import ImageFolder
@@ -33,6 +33,8 @@ from spherloc.trajectory import NS_PER_S
 
 Sizes = Mapping[tuple[int, int], Sequence[str]]
 """Names of images by their size (width, height)."""
+SIDEWAYS = 5
+"""From this orientation tag on, programs show an image turned by 90 degrees, one way or the other."""
 
 
 class CalibratedLens(NamedTuple):
@@ -109,7 +111,7 @@ def images_of_folder(root: Path, place: ImageFolder, sources: CameraSources) -> 
         remarks.append(lens.how)
     remarks += _about_rest(lensed, camera_of, sources)
     full = [name for name, camera in camera_of.items() if isinstance(camera, Equirectangular)]
-    remarks += about_turned(sorted(name for name in full if is_turned(folder / name)))
+    remarks += about_turned(sorted(name for name in full if orientation_of(folder / name) > 1))
     for_model: dict[str, Camera] = {}
     for camera in camera_of.values():
         if repr(camera) not in for_model:
@@ -193,6 +195,12 @@ def _by_lens(
 ) -> CalibratedLens:
     """The lens of images without a known camera, those of the most frequent size; raises ``InputError`` if they do not
     tell it, with the sentences ``unused`` on calibrations, which are ``unusable``, and shapes."""
+    lying = [name for size, names in sizes.items() if near_two_to_one(size[::-1]) for name in names]
+    if lying and all(orientation_of(folder / name) >= SIDEWAYS for name in lying):
+        raise InputError(
+            f"{folder}: its photographs, {_told(sizes)}, are panoramas that are stored on their side, with an "
+            "orientation tag, which is not used; save them turned, so that they are twice as wide as high."
+        )
     if sources.panorama and sources.of_map is None:
         raise InputError(
             f"{folder}: its photographs, {_told(sizes)}, are no full panoramas, which are twice as wide as high; "
