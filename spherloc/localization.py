@@ -20,6 +20,7 @@ from spherloc.diagnosis import Diagnosis, diagnose
 from spherloc.errors import CalibrationError, InputError, show
 from spherloc.estimators import estimate
 from spherloc.geometry import camera_centre
+from spherloc.metrics import AWAY, is_away
 from spherloc.outcome import Judgement, Outcome, judge
 from spherloc.problem import Problem
 from spherloc.registry import require
@@ -85,15 +86,17 @@ class Localization:
         """Why the run failed or is doubtful; runs further experiments, some tens of milliseconds."""
         return diagnose(self.trace)
 
+    def _place(self, position: FloatArray) -> str:
+        if is_away(position, self.trace.problem.points):
+            return AWAY
+        return f"{np.array2string(position, precision=3, suppress_small=True)} {self.trace.problem.unit}"
+
     def _rows(self) -> list[tuple[str, str]]:
         count, total = int(np.count_nonzero(self.inliers)), len(self.inliers)
         rows = [("outcome", f"{self.outcome} by {self.trace.estimator}")]
         if self.position is not None:
             rows += [
-                (
-                    "position",
-                    f"{np.array2string(self.position, precision=3, suppress_small=True)} {self.trace.problem.unit}",
-                ),
+                ("position", self._place(self.position)),
                 ("inliers", f"{count} of {total}"),
             ]
         if self.certificate is not None:

@@ -49,6 +49,8 @@ def translation_error_m(truth: FloatArray, estimate: FloatArray) -> float:
 
 BEYOND = "more than 1,000 times the extent of the map"
 """What is said instead of a length of which so much is true: no camera that sees the map is so far away."""
+AWAY = f"a place {BEYOND} away, which cannot be"
+"""What is said instead of the coordinates of a camera that is so far away."""
 _TIMES = 1000.0
 
 
@@ -62,6 +64,13 @@ def is_beyond(length_m: float, extent_m: float) -> bool:
     """Whether a length is absurd in a map of that extent (``extent_of``): a pose that few matches give can be
     anywhere. Never where the extent is 0, as that of one point."""
     return length_m > _TIMES * extent_m > 0.0
+
+
+def is_away(position: FloatArray, points: FloatArray) -> bool:
+    """Whether a position (3,) is absurdly far from the middle of map points (N, 3)."""
+    if not len(points):
+        return False
+    return is_beyond(float(np.linalg.norm(position - np.median(points, axis=0))), extent_of(points))
 
 
 def said_length(length_m: float, extent_m: float, text: str) -> str:

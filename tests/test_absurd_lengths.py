@@ -12,12 +12,12 @@ from spherloc.datasets.map_scene import MapScene
 from spherloc.diagnosis import diagnose
 from spherloc.estimators import estimate
 from spherloc.geometry import camera_centre, pose
-from spherloc.metrics import BEYOND, extent_of, is_beyond, said_length
+from spherloc.localization import Localization
+from spherloc.metrics import AWAY, BEYOND, extent_of, is_beyond, said_length
 from spherloc.trace import Trace
 from spherloc_viz.app.text import summary_of
 from spherloc_viz.commands.run import as_text
 from spherloc_viz.layers import paint, steps
-from spherloc_viz.layers.frame import AWAY
 from spherloc_viz.layers.outcome import outcome_table
 from spherloc_viz.layers.where_taken import where_taken
 
@@ -56,6 +56,7 @@ def test_the_extent_leaves_out_strays(rng: np.random.Generator) -> None:
 
 def test_an_absurd_pose_is_told_in_words() -> None:
     words = told(moved(1e7))
+    assert AWAY in repr(Localization(moved(1e7)))
     assert words.count(BEYOND) >= 4 and AWAY in words
     assert not any(digits in words for digits in ("e+0", "e+1", "000000 "))
 

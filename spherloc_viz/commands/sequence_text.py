@@ -13,8 +13,7 @@ from spherloc.experiments.summary import SuccessRate, Summary, TrajectoryError, 
 from spherloc.frontend.gravity_from_lines import why_not_found
 from spherloc.frontend.pipeline import NO_POINT
 from spherloc.mapping.scenes.joint_outcome import TRIED, tried_anew
-from spherloc.metrics import said_length
-from spherloc_viz.layers.frame import AWAY
+from spherloc.metrics import AWAY, said_length
 from spherloc_viz.layers.where_taken import nearest
 
 MAX_TOLD, MAX_EACH = 5, 20

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from spherloc.bounds import Bounds, bounds_of
 from spherloc.geometry import camera_centre, pose
-from spherloc.metrics import BEYOND, extent_of, is_beyond, said_length
+from spherloc.metrics import AWAY, BEYOND, extent_of, is_beyond, said_length
 from spherloc.refine import residuals_px
 from spherloc.trace import Trace
 from spherloc.types import BoolArray, ByteArray, FloatArray
@@ -278,10 +278,6 @@ def even(indices: np.ndarray, count: int) -> np.ndarray:
 def growing(total: int, *sizes: int) -> list[int]:
     """The sizes below ``total``, at which something of that size is shown while it grows."""
     return [size for size in sizes if size < total]
-
-
-AWAY = f"a place {BEYOND} away, which cannot be"
-"""What is said instead of coordinates of a camera that cannot be there."""
 
 
 def place_text(position: FloatArray, digits: int, metric: bool = True) -> str:

@@ -5,14 +5,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from spherloc.geometry import camera_centre
-from spherloc.metrics import SUCCESS_M, evaluate, extent_of, is_beyond
+from spherloc.metrics import AWAY, SUCCESS_M, evaluate, extent_of, is_away
 from spherloc.outcome import Judgement, Outcome, count_within_noise, judge
 from spherloc.problem import Problem
 from spherloc.trace import Certificate, RefinementStage, Trace
 from spherloc.types import FloatArray
 from spherloc_viz import style
 from spherloc_viz.layers import uncertainty
-from spherloc_viz.layers.frame import AWAY, Frame, Plan, RunView, angle_text, length, map_focus, place_text
+from spherloc_viz.layers.frame import Frame, Plan, RunView, angle_text, length, map_focus, place_text
 from spherloc_viz.layers.primitives import Table
 
 KNOWABLE = 0.01
@@ -152,7 +152,7 @@ def early_table(trace: Trace, judged: Judgement | None) -> Table:
     rows: list[tuple[str, str]] = [("estimator", trace.estimator), ("outcome", verdict(trace, metrics.success))]
     if trace.cam_from_map is not None:
         rows.append(("judged without the truth", "…" if judged is None else _judged(judged, metrics.success)))
-        rows.append(("camera position", _place(trace.problem, camera_centre(trace.cam_from_map), extent_m)))
+        rows.append(("camera position", _place(trace.problem, camera_centre(trace.cam_from_map))))
     if metrics.rotation_error_deg is not None and metrics.translation_error_m is not None:
         rows.append(("rotation error", f"{metrics.rotation_error_deg:.3f}°"))
         rows.append(("position error", length(metrics.translation_error_m, trace.problem.metric, extent_m)))
@@ -173,9 +173,8 @@ def early_table(trace: Trace, judged: Judgement | None) -> Table:
     return Table("outcome", ("", "this run"), tuple(rows))
 
 
-def _place(problem: Problem, position: FloatArray, extent_m: float) -> str:
-    away_m = float(np.linalg.norm(position - np.median(problem.points, axis=0)))
-    return AWAY if is_beyond(away_m, extent_m) else place_text(position, 3, problem.metric)
+def _place(problem: Problem, position: FloatArray) -> str:
+    return AWAY if is_away(position, problem.points) else place_text(position, 3, problem.metric)
 
 
 def _times(timings_ms: Mapping[str, float]) -> str:

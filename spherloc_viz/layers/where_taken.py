@@ -7,9 +7,10 @@ import numpy as np
 from spherloc.datasets.map_scene import MapScene
 from spherloc.errors import shorten
 from spherloc.geometry import camera_centre
+from spherloc.metrics import AWAY
 from spherloc.trace import Trace
 from spherloc.types import FloatArray
-from spherloc_viz.layers.frame import AWAY, length_text
+from spherloc_viz.layers.frame import length_text
 
 NAMED = 2
 """Largest number of references that are named."""
