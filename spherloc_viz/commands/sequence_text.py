@@ -38,7 +38,7 @@ def sequence_text(results: SequenceResults, summary: Summary, scene: MapScene) -
         lines.append(f"  {first} initialised by {setting.options['initialise']}, the others tracked")
     if anew := sum(row.status == LOCALIZED and tried_anew(row) for row in results.rows):
         lines.append(f"  {anew} of them around the poses that queries taken together with them give")
-    lines += [f"  {line}" for line in _wrong(results)]
+    lines += [f"  {line}" for line in _wrong(results, scene.extent_m)]
     rates = (*summary.success, *summary.registration_success)
     lines += [f"  success {_rate(rate, setting.unit)}" for rate in rates if rate.judged or not summary.without_truth]
     lines += [f"  {line}" for line in _by_folder(results)]
@@ -100,15 +100,16 @@ def _names(names: Collection[str]) -> str:
     return f": {', '.join(said[:MAX_EACH])}{', …' if len(said) > MAX_EACH else ''}" if said else ""
 
 
-def _wrong(results: SequenceResults) -> Iterator[str]:
-    """A line on the queries that are localized with an error beyond all limits of the scene."""
+def _wrong(results: SequenceResults, extent_m: float) -> Iterator[str]:
+    """A line on the queries that are localized beyond all limits of the scene, in a map of that extent."""
     limits, wrong = results.configuration.thresholds, []
     for row in results.rows:
         turned, moved = row.rotation_error_deg, row.translation_error_m
         if row.status != LOCALIZED or turned is None or moved is None or not limits:
             continue
         if all(turned > degrees or moved > metres for degrees, metres in limits):
-            wrong.append(f"{row.query}: {turned:.3g} deg and {results.configuration.length(moved)} off")
+            off = said_length(moved, extent_m, results.configuration.length(moved))
+            wrong.append(f"{row.query}: {turned:.3g} deg and {off} off")
     if wrong:
         more = f"; and {len(wrong) - MAX_TOLD} more, see results.csv" if len(wrong) > MAX_TOLD else ""
         yield f"wrong by the truth, though localized: {'; '.join(wrong[:MAX_TOLD])}{more}"

@@ -30,7 +30,9 @@ from spherloc.experiments.kept_results import kept_results
 from spherloc.experiments.sequence import inputs_of, localize_queries
 from spherloc.experiments.summary import summarize
 from spherloc.frontend.view import Gravity, View
+from spherloc.geometry import pose
 from spherloc.mapping.scenes.scene_files import MODEL, SCENE
+from spherloc.metrics import AWAY, BEYOND
 from spherloc.trajectory import read_tum
 from spherloc.warm_up import warm_up
 from spherloc_viz.app.catalog import Catalog
@@ -457,6 +459,13 @@ def test_what_other_queries_say_is_written_and_told(
     assert isinstance(loaded, MapScene)
     assert said_of("image1.png", results.rows[1], loaded).endswith(why) and not results.rows[0].doubts
     assert f"image1.png is doubtful: {why}" in sequence_html(results.rows, loaded)
+    far = replace(results.rows[0], cam_from_map=pose(np.eye(3), np.full(3, 1e9)), translation_error_m=1e9)
+    lost = replace(results, rows=(far, *results.rows[1:]))
+    known = replace(loaded, cloud=np.eye(3))
+    text = sequence_text(lost, summarize(lost), known)
+    assert f"image0.png: localized, at {AWAY}, " in text and f"deg and {BEYOND} off" in text
+    assert f"ATE of all 3 poses: {BEYOND}" in text
+    assert BEYOND in said_of("image0.png", far, known) and "e+0" not in text and "00000" not in text
     aligned = replace(loaded, truth_source="mocap0, aligned with the map")
     assert "The true poses are those of mocap0, aligned with the map." in sequence_html(results.rows, aligned)
     assert "  the true poses are those of mocap0, al" in sequence_text(results, summarize(results), aligned)
