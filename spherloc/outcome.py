@@ -173,10 +173,10 @@ def _error_margin(trace: Trace, aligned: AlignedProblem, state: FloatArray, inli
     rotation, position = sd_of(aligned, state, inliers, trace.options)
     if np.isinf(position):
         return -np.inf, "Its inliers do not fix it."
-    if is_beyond(position, extent_of(trace.problem.points)):
-        return -np.inf, "Its inliers do not fix its position."
     worst = MIN_SDS * max(np.degrees(rotation) / SUCCESS_DEG, position / SUCCESS_M, 1e-300)
     fixed = f"{np.degrees(rotation):.2g}° and {position:.2g} {trace.problem.unit}"
+    if is_beyond(position, extent_of(trace.problem.points)):
+        return -np.log(worst), "Its inliers do not fix its position."
     return -np.log(worst), f"Its inliers fix it to no better than {fixed} (1 sd)."
 
 
