@@ -195,7 +195,7 @@ def _by_lens(
 ) -> CalibratedLens:
     """The lens of images without a known camera, those of the most frequent size; raises ``InputError`` if they do not
     tell it, with the sentences ``unused`` on calibrations, which are ``unusable``, and shapes."""
-    lying = [name for size, names in sizes.items() if near_two_to_one(size[::-1]) for name in names]
+    lying = [name for size, names in sizes.items() if near_two_to_one((size[1], size[0])) for name in names]
     if lying and all(orientation_of(folder / name) >= SIDEWAYS for name in lying):
         raise InputError(
             f"{folder}: its photographs, {_told(sizes)}, are panoramas that are stored on their side, with an "
