@@ -22,8 +22,8 @@ from spherloc.types import ByteArray, FloatArray
 
 INPUT_PX = 1024
 """Longer side to which images are scaled, small ones too: a keypoint is exact to a share of a pixel of the network. At
-640 pixels, a third of the time, poses of fisheyes of 640 pixels were up to half as exact again as by SIFT
-(``python -m benchmarks.features_pose``)."""
+640 pixels, in a third of the time, the pose of a fisheye by references of its own camera was half as far off again as
+by SIFT (``python -m benchmarks.features_pose``)."""
 FACE_PX = 640
 """Longer side to which larger faces of a panorama are shrunk: there are twelve of them."""
 MIN_SCORE = 0.01
