@@ -49,6 +49,15 @@ def test_a_single_query_has_a_dot_of_some_size() -> None:
     assert len(dots.positions) == 1 and dots.radius_m > 0 and len(truth.points) == len(errors.points) == 0
 
 
+def test_dots_leave_room_between_places_whatever_their_order() -> None:
+    """Photographs of two rooms by turns, some at one spot; one that is far away does not make the others large."""
+    places = [(10.0 * (k % 2), 0.1 * k, 0.0) for k in range(40)]
+    dots, *_ = drawn([row(k, place, None) for k, place in enumerate([*places, places[-1], (1e8, 0, 0)])], np.eye(3))
+    assert 0.01 < dots.radius_m < 0.02
+    close = [row(k, (1e-4 * k, 0.0, 10.0 * (k % 2)), None) for k in range(40)]
+    assert 0.005 < drawn(close, np.eye(3))[0].radius_m < 0.02  # still to be seen
+
+
 def test_the_ramp_spans_the_successes() -> None:
     colors = style.error_colors(np.array([0.0, 0.1, 0.2, 50.0, np.inf, np.nan]), 2.0)
     assert [tuple(color) for color in colors[:3]] == list(style.ERROR_RAMP)

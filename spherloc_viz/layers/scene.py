@@ -11,6 +11,7 @@ from spherloc.cameras.base import Camera, in_image
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.experiments.results import QueryResult
 from spherloc.geometry import camera_centre
+from spherloc.metrics import extent_of
 from spherloc.problem import Problem
 from spherloc.types import ByteArray, FloatArray, IntArray
 from spherloc_viz import style
@@ -206,8 +207,9 @@ def _body(cam_from_map: FloatArray, size_m: float) -> Mesh:
     return Mesh("cameras/ghost", "cameras", corners, np.vstack([faces, faces[:, ::-1]]), style.TRUTH, 0.16)
 
 
-DOT_SHARE = 0.06
-"""Radius of a dot as a share of the usual distance between neighbours, so that dots do not hide each other."""
+DOT_SHARE, LEAST_DOT_SHARE = 0.06, 1e-3
+"""Radius of a dot as a share of the usual distance to the nearest other one, so that dots do not hide each other, but
+at least the second share of the extent of all, so that they can be seen."""
 
 
 def trajectory_items(rows: Sequence[QueryResult], map_turn: FloatArray, limit_m: float) -> tuple[SceneItem, ...]:
@@ -230,8 +232,7 @@ def trajectory_items(rows: Sequence[QueryResult], map_turn: FloatArray, limit_m:
     both = known & located
     offsets = np.stack([truth, found], axis=1)[both]
     taken = tuple(row.query for row, is_shown in zip(rows, shown, strict=True) if is_shown)
-    steps = np.linalg.norm(np.diff(places[shown], axis=0), axis=1)
-    dot_m = DOT_SHARE * float(np.median(steps)) if len(steps) else limit_m
+    dot_m = _dot_radius_m(places[shown]) or limit_m
     above = np.array([0.0, -3.0 * dot_m, 0.0])  # names of the map's images are below their dots
     names = [
         Label(f"trajectory/name-{k}", "trajectory", place + above, name)
@@ -243,3 +244,14 @@ def trajectory_items(rows: Sequence[QueryResult], map_turn: FloatArray, limit_m:
         Segments("trajectory/errors", "trajectory", offsets, colors[both], 2.0),
         *(names if len(names) <= MAX_NAMED else ()),
     )
+
+
+def _dot_radius_m(places: FloatArray) -> float:
+    """Radius of dots at places (K, 3), of which those at one spot count once; 0 if they are all at one spot."""
+    from scipy.spatial import KDTree  # takes half a second
+
+    spots = np.unique(places, axis=0)
+    if len(spots) < 2:
+        return 0.0
+    nearest = KDTree(spots).query(spots, k=2)[0][:, 1]
+    return max(DOT_SHARE * float(np.median(nearest)), LEAST_DOT_SHARE * extent_of(spots))
