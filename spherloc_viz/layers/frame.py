@@ -132,8 +132,8 @@ class RunView:
     @cached_property
     def sphere_m(self) -> float:
         """Radius at which the unit sphere is drawn, metres."""
-        extent = self.of_map("extent", lambda: float(np.median(np.linalg.norm(self.points - self.middle, axis=1))))
-        return SPHERE_SHARE * max(extent, 1e-3)
+        away = self.of_map("away", lambda: float(np.median(np.linalg.norm(self.points - self.middle, axis=1))))
+        return SPHERE_SHARE * max(away, 1e-3)
 
     @cached_property
     def dot_m(self) -> float:
@@ -202,11 +202,7 @@ class RunView:
 
     def is_away(self, position: FloatArray) -> bool:
         """Whether a place (3,) of the aligned map frame is absurdly far away from the map."""
-        return is_beyond(float(np.linalg.norm(position - self._median)), self.extent_m)
-
-    @property
-    def _median(self) -> FloatArray:
-        return self.of_map("median", lambda: np.median(self.points, axis=0))
+        return is_beyond(float(np.linalg.norm(position - self.middle)), self.extent_m)
 
     @property
     def extent_m(self) -> float:
