@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from spherloc.trace import (
     TranslationStage,
     YawStage,
 )
-from spherloc_viz import style
+from spherloc_viz import layers, style
 from spherloc_viz.layers import paint, steps
 from spherloc_viz.layers.ball_set import MAX_SURFACES
 from spherloc_viz.layers.frame import angle_text
@@ -524,3 +525,10 @@ def test_no_pose_and_no_truth_are_said() -> None:
         picture = paint(trace, len(steps(trace)) - 1)
         assert picture.step.title == "No pose" and "cameras/estimate" not in {found.name for found in picture.scene}
         assert ("outcome", "no pose") in outcome_table(trace).rows
+
+
+def test_what_runs_share_of_a_map_has_names_of_its_own() -> None:
+    """Two numbers under one name would be taken for each other."""
+    sources = [path.read_text("utf-8") for path in Path(layers.__file__).parent.glob("*.py")]
+    names = [name for source in sources for name in re.findall(r'of_map\(\s*"([^"]+)"', source)]
+    assert len(names) > 5 and len(set(names)) == len(names), sorted(names)
