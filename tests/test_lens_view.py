@@ -14,6 +14,7 @@ from spherloc.experiments.results import QueryResult
 from spherloc.frontend.view import View
 from spherloc.geometry import pose
 from spherloc_viz.app.controls.query_strip import ORDERS, QueryStrip, Strip, end_of, ordered, strip_html, thumbnail
+from spherloc_viz.app.paging import pages_html
 from spherloc_viz.layers.lens_view import through_lens
 
 LENS = KannalaBrandt(320, 320, 110.0, 110.0, 160.0, 160.0, (0.0, 0.0, 0.0, 0.0))
@@ -93,7 +94,7 @@ def test_the_strip_is_sorted_turned_and_told(tmp_path):
     shown = ordered(queries, rows, "outcome")[:24]
     strip = Strip(shown, dict.fromkeys((view.name for view in shown), ""), rows, "<q11>", "m")
     html = strip_html(strip, ORDERS, "outcome", 0, 50)
-    assert "page 1 of 3" in html and "strip-page:1" in html and "<q30>" not in html and "&lt;q30&gt;: failed" in html
+    assert "1–24 of 50" in html and "strip-page:1" in html and "<q30>" not in html and "&lt;q30&gt;: failed" in html
     assert html.count("strip-open:") == 24 and "9 of 80 matches" in html
     pressed = html.partition("strip-open:&lt;q00&gt;")[2].partition('role="listitem"')[0]
     assert pressed.endswith("&lt;q00&gt;</div></div></div><div "), "the name below a picture is part of its button"
@@ -101,6 +102,20 @@ def test_the_strip_is_sorted_turned_and_told(tmp_path):
     assert thumbnail(queries[0]) == ""
     cv2.imwrite(str(queries[0].path), np.full((320, 320, 3), 90, np.uint8))
     assert thumbnail(queries[0]).startswith("data:image/jpeg;base64,")
+
+
+def test_a_page_in_the_midst_of_many_is_a_few_presses_away():
+    """The pages beside, ten before and after, the first and the last; of two pages the other one only."""
+
+    def targets(page: int, count: int) -> list[int]:
+        return [
+            int(place) for place in re.findall(r'data-touch="rows:(\d+)"', pages_html(page, count, "rows", size=24))
+        ]
+
+    assert targets(60, 3000) == [59, 0, 50, 60, 70, 124, 61]
+    assert targets(0, 3000) == [0, 10, 124, 1] and targets(124, 3000) == [123, 0, 114, 124]
+    assert targets(0, 25) == [1] and targets(1, 25) == [0] and targets(0, 24) == targets(0, 0) == []
+    assert "1,441–1,464 of 3,000" in pages_html(60, 3000, "rows", size=24)
 
 
 def test_the_strip_turns_to_the_query_that_the_page_shows(tmp_path):
@@ -112,7 +127,7 @@ def test_the_strip_turns_to_the_query_that_the_page_shows(tmp_path):
     scene: Any = SimpleNamespace(queries=queries, metric=True)
 
     def expect(page: int, marks: int) -> None:
-        until(lambda: shown and f"page {page} of 3" in shown[-1] and shown[-1].count("3px solid") == marks)
+        until(lambda: shown and f"{24 * page - 23}–" in shown[-1] and shown[-1].count("3px solid") == marks)
         assert len(re.findall("strip-open:", shown[-1])) == (12 if page == 3 else 24)
 
     strip.set(scene, (), False, "q40")

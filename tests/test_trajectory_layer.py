@@ -1,5 +1,7 @@
 """A sequence on the canvas: places, colours by error, and what has no pose."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from spherloc.experiments.results import FAILED, LOCALIZED, QueryResult
@@ -15,7 +17,7 @@ def row(index: int, found: tuple[float, float, float] | None, truth: tuple[float
     """A query whose camera was found and truly was at these places, unturned."""
     poses = [None if place is None else pose(np.eye(3), -np.array(place)) for place in (found, truth)]
     status = FAILED if found is None else LOCALIZED
-    return QueryResult(index, f"q{index}", status, cam_from_map=poses[0], truth_cam_from_map=poses[1])
+    return QueryResult(index, f"q{index}", status, float(index), cam_from_map=poses[0], truth_cam_from_map=poses[1])
 
 
 def drawn(rows: list[QueryResult], map_turn: np.ndarray) -> tuple[Points, Segments, Segments]:
@@ -42,6 +44,14 @@ def test_failures_are_marked_where_they_should_be_and_gaps_are_left_open() -> No
     assert tuple(dots.colors[1]) == style.OUTLIER and tuple(dots.colors[2]) == style.ESTIMATE
     assert len(truth.points) == 1 and len(errors.points) == 1
     assert np.isfinite(dots.positions).all() and dots.radius_m > 0
+
+
+def test_true_positions_of_photographs_without_times_are_not_joined() -> None:
+    rows = [row(k, (k, 1, 0), (k, 0, 0)) for k in range(3)]
+    assert len(drawn(rows, np.eye(3))[1].points) == 2
+    for unordered in ([replace(one, timestamp_s=None) for one in rows], rows[::-1]):
+        dots, truth, errors = drawn(unordered, np.eye(3))
+        assert len(truth.points) == 0 and len(dots.positions) == len(errors.points) == 3
 
 
 def test_a_single_query_has_a_dot_of_some_size() -> None:

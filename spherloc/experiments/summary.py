@@ -243,7 +243,7 @@ def _trajectory_error(results: SequenceResults) -> TrajectoryError | None:
         np.array([inverse_pose(getattr(row, name)) for row in rows]).reshape(-1, 3, 4)
         for name in ("truth_cam_from_map", "cam_from_map")
     )
-    return trajectory_error(truth, estimate, timed(results))
+    return trajectory_error(truth, estimate, timed(results.rows))
 
 
 def success_rates(rows: Sequence[QueryResult], thresholds: Thresholds) -> tuple[SuccessRate, ...]:
@@ -310,16 +310,16 @@ def true_trajectory(results: SequenceResults) -> Trajectory:
     return _trajectory(results, "truth_cam_from_map")
 
 
-def timed(results: SequenceResults) -> bool:
+def timed(rows: Sequence[QueryResult]) -> bool:
     """Whether every query has a time and the times grow; else a query's time is its index in the sequence."""
-    times = [row.timestamp_s for row in results.rows]
+    times = [row.timestamp_s for row in rows]
     if any(time is None or not abs(time) < LATEST_S for time in times):
         return False
-    return bool((np.diff([_nanoseconds(row, True) for row in results.rows]) > 0).all())
+    return bool((np.diff([_nanoseconds(row, True) for row in rows]) > 0).all())
 
 
 def _trajectory(results: SequenceResults, field: str) -> Trajectory:
-    by_time = timed(results)
+    by_time = timed(results.rows)
     rows = [row for row in results.rows if getattr(row, field) is not None]
     times = np.array([_nanoseconds(row, by_time) for row in rows], dtype=np.int64)
     inverse = [inverse_pose(getattr(row, field)) for row in rows]

@@ -68,7 +68,7 @@ def sequence_text(results: SequenceResults, summary: Summary, scene: MapScene) -
         f"  {line}"
         for line in (*_skipped(summary), *_each(results, scene), *_without_pose(results.rows), *_remarks(results.rows))
     ]
-    if not timed(results):
+    if not timed(results.rows):
         none = any(row.timestamp_s is None for row in results.rows)
         why = "not all queries have a time" if none else "those of the queries do not always grow"
         lines.append(f"  trajectory: times are places in the sequence, as {why}")

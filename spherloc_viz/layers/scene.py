@@ -10,6 +10,7 @@ import numpy as np
 from spherloc.cameras.base import Camera, in_image
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.experiments.results import QueryResult
+from spherloc.experiments.summary import timed
 from spherloc.geometry import camera_centre
 from spherloc.metrics import extent_of
 from spherloc.problem import Problem
@@ -217,7 +218,8 @@ def trajectory_items(rows: Sequence[QueryResult], map_turn: FloatArray, limit_m:
 
     ``rows`` are in the order of the sequence, ``map_turn`` (3, 3) turns the map to the aligned map, and ``limit_m``
     is the loosest limit of success. Few queries are named. Poses whose truth is unknown have the estimate's colour; a
-    query without a pose is a dot in the outliers' colour where it truly was.
+    query without a pose is a dot in the outliers' colour where it truly was. True positions are joined only where the
+    queries follow each other in time.
     """
     truth = np.array([row.true_position_m for row in rows]).reshape(-1, 3) @ map_turn.T
     found = np.array([row.position_m for row in rows]).reshape(-1, 3) @ map_turn.T
@@ -227,7 +229,7 @@ def trajectory_items(rows: Sequence[QueryResult], map_turn: FloatArray, limit_m:
     places = np.where(located[:, None], found, truth)
     colors[~located] = style.OUTLIER
     shown = located | known
-    followed = known[:-1] & known[1:]
+    followed = known[:-1] & known[1:] & timed(rows)
     legs = np.stack([truth[:-1], truth[1:]], axis=1)[followed]
     both = known & located
     offsets = np.stack([truth, found], axis=1)[both]

@@ -102,7 +102,7 @@ def trajectory_png(results: SequenceResults, backdrop: Backdrop) -> bytes:
     if len(panels) > 1:
         _overview(panels[0], panels[1], places, true_places)
     axes = panels[-1]
-    _truth(axes, true_places, timed(results))
+    _truth(axes, true_places, timed(results.rows))
     arrows = _directions(axes, results, places)
     _estimates(figure, axes, results, places, true_places)
     _without_place(axes, results, places, true_places)
@@ -273,7 +273,7 @@ def trajectories_png(several: Sequence[tuple[str, SequenceResults]], backdrop: B
     if len(panels) > 1:
         _overview(panels[0], panels[1], everywhere, true_places)
     axes = panels[-1]
-    _truth(axes, true_places, timed(first))
+    _truth(axes, true_places, timed(first.rows))
     labels: list[PlaceName] = []
     for number, ((label, results), seen) in enumerate(zip(several, places, strict=True)):
         style = _Style(
@@ -313,7 +313,7 @@ def _one_of_several(
         words = f"{label}: {np.count_nonzero(errors_m <= limit_m)} of {len(seen)} within {limit}"
     else:  # there is no truth
         words = f"{label}: {results.status.count(LOCALIZED)} of {len(seen)} localized"
-    line, color = "-" if timed(results) else "none", style.color
+    line, color = "-" if timed(results.rows) else "none", style.color
     axes.plot(
         *seen[inside].T, color=color, linestyle=line, linewidth=0.9, marker=style.marker, markersize=style.size,
         fillstyle="none", label=words,

@@ -21,6 +21,7 @@ from spherloc.files import is_file
 from spherloc.frontend.view import View
 from spherloc.metrics import said_length
 from spherloc_viz import style
+from spherloc_viz.app.paging import pages_html
 from spherloc_viz.app.text import DIM, box
 from spherloc_viz.app.web.touch import Touch, Touches
 from spherloc_viz.app.workers import BackgroundWorker
@@ -186,10 +187,7 @@ def strip_html(strip: Strip, orders: Mapping[str, str], order: str, page: int, c
     sorting = " · ".join(
         f"<b>{words}</b>" if key == order else _pressed(f"strip-order:{key}", words) for key, words in orders.items()
     )
-    pages = (count - 1) // PAGE + 1
-    turns = ((page - 1, "‹ before"), (page + 1, "after ›"))
-    links = " ".join(_pressed(f"strip-page:{to}", words) for to, words in turns if 0 <= to < pages)
-    turning = f'<div style="padding:.25em 0">page {page + 1} of {pages} {links}</div>' if pages > 1 else ""
+    turning = pages_html(page, count, "strip-page", size=PAGE) if count > PAGE else ""
     cells = "".join(_cell(view, strip) for view in strip.shown)
     return box(
         f'<div style="{DIM};padding-bottom:.25em">Queries {sorting}</div>'
