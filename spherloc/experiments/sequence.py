@@ -2,12 +2,12 @@
 
 import hashlib
 import re
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -220,36 +220,20 @@ def _array(value: Any) -> FloatArray | None:
     return None if value is None else np.asarray(value, dtype=np.float64)
 
 
-class _Job(threading.Thread, Generic[R]):
-    """Work in a thread of its own. Python waits for it at the end: stopping a thread inside OpenCV would crash."""
-
-    def __init__(self, work: Callable[[], R]) -> None:
-        super().__init__(name="spherloc-matching")
-        self._work = work
-        self._done: R
-        self._error: BaseException | None = None
-        self.start()
-
-    def run(self) -> None:
-        try:
-            self._done = self._work()
-        except BaseException as error:
-            self._error = error
-
-    def result(self) -> R:
-        self.join()
-        if self._error is not None:
-            raise self._error
-        return self._done
-
-
 def _one_ahead(work: Callable[[T], R], items: Iterable[T]) -> Iterator[tuple[T, R]]:
-    """Each item with the result of ``work``, in order; a thread works on the next item while the caller uses one."""
-    waiting: tuple[T, _Job[R]] | None = None
-    for item in items:
-        done = None if waiting is None else (waiting[0], waiting[1].result())
-        waiting = item, _Job(lambda item=item: work(item))
-        if done is not None:
-            yield done
-    if waiting is not None:
-        yield waiting[0], waiting[1].result()
+    """Each item with the result of ``work``, in order; a thread works on the next item while the caller uses one.
+
+    It is a pool's, which Ctrl-C does not make Python forget: stopping a thread inside OpenCV would crash.
+    """
+    pool = ThreadPoolExecutor(1, "spherloc-matching")
+    waiting: tuple[T, Future[R]] | None = None
+    try:
+        for item in items:
+            done = None if waiting is None else (waiting[0], waiting[1].result())
+            waiting = item, pool.submit(work, item)
+            if done is not None:
+                yield done
+        if waiting is not None:
+            yield waiting[0], waiting[1].result()
+    finally:
+        pool.shutdown(wait=False)

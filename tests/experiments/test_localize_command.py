@@ -55,7 +55,7 @@ from tests.waiting import LIMIT_S
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = [sys.executable, "-c", "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
-           "from spherloc_viz.commands.cli import main\nmain()", "localize"]  # fmt: skip
+           "from spherloc_viz.start import main\nmain()", "localize"]  # fmt: skip
 """A shell's background job, and what it starts, ignores SIGINT."""
 
 
