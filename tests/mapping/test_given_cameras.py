@@ -111,3 +111,17 @@ def test_a_calibration_beside_photographs_that_leaves_a_question_is_told(photogr
     told = str(caught.value)
     assert "the four dist_coeffs may be those of a fisheye or of a pinhole: add distortion_model" in told
     assert "notes" not in told and "labels" not in told
+
+
+def test_kalibr_files_of_one_camera_each_are_the_cameras_that_they_are_called(tmp_path, photographs):
+    """Each of them calls its camera cam0."""
+    folder = tmp_path / "calibrations"
+    folder.mkdir()
+    for name, focal in (("front", 300.0), ("left", 310.0)):
+        (folder / f"{name}.yaml").write_text(
+            "cam0:\n  camera_model: pinhole\n  distortion_model: equidistant\n  resolution: [640, 480]\n"
+            f"  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]\n  intrinsics: [{focal}, {focal}, 320.0, 240.0]\n"
+        )
+    cameras, remarks = given_cameras(folder, None, photographs)
+    assert {name: camera.fx for name, camera in cameras.items()} == {"front": 300.0, "left": 310.0} and not remarks
+    assert given_cameras(folder, "left", photographs)[0].keys() == {"left"}

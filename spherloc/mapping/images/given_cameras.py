@@ -37,7 +37,8 @@ def given_cameras(place: Path, name: str | None, folder: Path) -> tuple[dict[str
         except CalibrationError as error:
             remarks.append(f"It is not used: {error}")
             continue
-        cameras |= {one or file.stem: camera for one, camera in found.items()}
+        # a Kalibr file of one camera calls it cam0, whichever of the cameras it is
+        cameras |= found if len(found) > 1 else dict.fromkeys([file.stem], *found.values())
         remarks += about
     if not cameras:
         raise CalibrationError(
