@@ -70,6 +70,15 @@ def test_a_calibration_of_the_same_shape_is_scaled_and_told(tmp_path, photograph
     assert given_cameras(file, None, photographs) == ({"": FISHEYE}, []), "some have its size"
 
 
+def test_a_calibration_is_scaled_for_a_sequence_with_folders_of_cameras_too(tmp_path, photographs):
+    file = tmp_path / "big.toml"
+    file.write_text("[camera]\n" + "".join(f"{key} = {value!r}\n" for key, value in FISHEYE.to_dict().items()))
+    (tmp_path / "drive" / "cam0").mkdir(parents=True)
+    photographs.rename(tmp_path / "drive" / "cam0" / "data")
+    for place in (tmp_path / "drive", tmp_path / "drive" / "cam0"):
+        assert given_cameras(file, None, place)[0] == {"": scaled(FISHEYE, 640, 480)}
+
+
 def test_a_file_of_opencv_without_a_size_has_that_of_the_photographs(tmp_path, photographs):
     file = tmp_path / "kd.yml"
     file.write_text(OPENCV)

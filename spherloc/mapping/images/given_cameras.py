@@ -8,6 +8,7 @@ from spherloc.cameras.base import Camera
 from spherloc.cameras.calibration import about_calibration, camera_names, load_camera
 from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.cameras.scaling import scaled
+from spherloc.datasets.asl_layout import asl_sequence
 from spherloc.errors import CalibrationError, InputError, show
 from spherloc.files import is_folder, is_image, names_in
 from spherloc.images import read_size
@@ -87,7 +88,10 @@ def _scaled(file: Path, cameras: Mapping[str, Camera], size: Size) -> tuple[dict
 
 
 def _images_in(folder: Path) -> Iterator[Path]:
-    """The images in a folder or, if there are none, in the folders in it."""
+    """The images in a folder or, if there are none, in the folders in it; of a sequence in the ASL layout all."""
+    if (sequence := asl_sequence(folder)) is not None:
+        yield from (place / name for place in sequence.cameras.values() for name in names_in(place) if is_image(name))
+        return
     names = names_in(folder) if is_folder(folder) else []
     paths = [folder / name for name in names if is_image(name)]
     inside = [] if paths else [folder / name for name in names if is_folder(folder / name)]
