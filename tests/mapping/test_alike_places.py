@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from scipy.spatial.transform import Rotation
 
 from spherloc.geometry import pose
 from spherloc.mapping.make import nearer_to_others
@@ -80,6 +81,22 @@ def test_the_ends_of_a_walk_need_not_match(rng):
 
     assert at(0.0, 0.2, 1.2) == ()
     assert set(map(frozenset, at(0.0, 0.6, 1.2))) == {frozenset("ac")}
+
+
+def test_fisheyes_that_look_opposite_ways_need_not_match(rng):
+    """The front camera of a robot, and the one at its back as it stands a little farther on."""
+    counts = np.array([[0, 10, 300, 0], [10, 0, 0, 300], [300, 0, 0, 0], [0, 300, 0, 0]])
+    seen = dict.fromkeys("abcd", all_of(walls(rng)))
+
+    def turned(degrees: float, **kinds) -> tuple[tuple[str, str], ...]:
+        back = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+        poses = {name: pose(np.eye(3), -np.array([0.0, 0.0, z])) for name, z in zip("ac", (0.0, 0.7), strict=True)}
+        poses |= {name: pose(back, -back @ [0.0, 0.0, z]) for name, z in zip("bd", (0.3, 1.0), strict=True)}
+        return contradictions(poses, list("abcd"), counts, seen, **kinds)
+
+    assert ("a", "b") not in turned(180.0, fisheyes=set("abcd"))
+    assert ("a", "b") in turned(180.0)  # panoramas see all around
+    assert ("a", "b") in turned(90.0, fisheyes=set("abcd"))
 
 
 def test_a_map_of_two_rooms_in_one_place_is_cut_between_them(rng):

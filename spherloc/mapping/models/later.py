@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from spherloc.cameras.equirectangular import Equirectangular
 from spherloc.errors import ProblemError
 from spherloc.estimators import default_options, estimate
 from spherloc.frontend.view import Gravity, View
@@ -69,6 +70,7 @@ def place_rest(
     cameras are fixed to each other. An image that contradicts others once its points are in the map is left out again.
     """
     names, shots = [view.name for view in views], shots_of(views)
+    fisheyes = {view.name for view in views if not isinstance(view.camera, Equirectangular)}
     refused = set(elsewhere)
     for round_number in count(1):
         left = [view for view in views if view.name not in made.poses and view.name not in refused]
@@ -79,7 +81,7 @@ def place_rest(
             expected |= expected_by_calibration(made.poses, fixed)
         for done, view in enumerate(left, start=1):
             one = _place(made, view, gravity.get(view.name), level, unit, expected.get(view.name))
-            if one is not None and _undoubted(made, names, view.name, one):
+            if one is not None and _undoubted(made, names, view.name, one, fisheyes):
                 placed[view.name] = one
             tell(f"left-out images tried, round {round_number}", done, len(left))
         if not placed:
@@ -151,11 +153,14 @@ def _place(
     return _Placed(np.column_stack([pose[:, :3], pose[:, 3] / unit]), pairs[inliers, 0], pairs[inliers, 1])
 
 
-def _undoubted(made: Reconstruction, names: Sequence[str], name: str, placed: _Placed) -> bool:
+def _undoubted(
+    made: Reconstruction, names: Sequence[str], name: str, placed: _Placed, fisheyes: Collection[str]
+) -> bool:
     """Whether its neighbours in the map match it: at a place that only looks alike, hardly any do."""
     poses = {**made.poses, name: placed.cam_from_model}
     points = {**points_of(made.model), name: SeenPoints.of(made.model, placed.points.tolist())}
-    return not any(name in pair for pair in contradictions(poses, names, made.all_matches, points))
+    against = contradictions(poses, names, made.all_matches, points, fisheyes=fisheyes)
+    return not any(name in pair for pair in against)
 
 
 def with_images(made: Reconstruction, poses: Mapping[str, FloatArray], adjust: bool = True) -> Reconstruction:

@@ -27,6 +27,9 @@ MIN_SUPPORT = 0.15
 SIGHT_RAD, SIGHT_POINTS, SIGHT_FACTOR = np.radians(25.0), 8, 1.2
 """An image sees past another camera if it has at least the second number of points within the first angle around the
 direction of that camera, and half of them are farther away than the camera by the third factor."""
+OPPOSED_RAD = np.radians(120.0)
+"""Two fisheyes whose optical axes differ by more see hardly the same things and need not match: the front camera of a
+robot and, a moment later, the one at its back, which then stands right before it."""
 SAME_VIEW_RAD, SAME_VIEW_DEPTH = np.radians(15.0), 1.5
 """Two panoramas should see a point alike if the rays to it differ by less, and its distances by a smaller factor."""
 SAME_VIEW_POINTS, SAME_VIEW_NEAR, MIN_SEEN = 100, 1.5, 0.1
@@ -118,7 +121,8 @@ class Reconstruction:
     def judged(self) -> "Reconstruction":
         """The model with its contradictions computed anew."""
         seen, panoramas = points_of(self.model), panoramas_of(self.model)
-        against = contradictions(self.poses, list(self.ids), self.all_matches, seen, panoramas)
+        fisheyes = self.poses.keys() - panoramas
+        against = contradictions(self.poses, list(self.ids), self.all_matches, seen, panoramas, fisheyes)
         return replace(self, contradictions=against)
 
     def points(self) -> FloatArray:
@@ -218,9 +222,10 @@ def contradictions(
     counts: NDArray[np.int64],
     points: Mapping[str, SeenPoints],
     panoramas: Collection[str] = (),
+    fisheyes: Collection[str] = (),
 ) -> tuple[tuple[str, str], ...]:
     """Pairs of neighbouring images of ``poses``, in sight of each other, that hardly match or, of ``panoramas``, hardly
-    see each other's points.
+    see each other's points. Two of ``fisheyes``, which look to one side, need not match if they look opposite ways.
 
     ``counts`` (V, V) are the numbers of matches of all ``names``, ``points`` what each image sees.
     """
@@ -242,6 +247,7 @@ def contradictions(
                 place in nearby
                 and apart[row, place] <= NEAR * min(nearest[row], nearest[place])
                 and counts[index, other] < MIN_SUPPORT * min(best[index], best[other])
+                and not (names[index] in fisheyes and names[other] in fisheyes and _opposed(poses, pair))
             )
             side_by_side = row < place and beside[row, place]
             if not hardly_match and not side_by_side:
@@ -252,6 +258,12 @@ def contradictions(
             if unseen or (hardly_match and all(past)):
                 found.append(pair)
     return tuple(found)
+
+
+def _opposed(poses: Mapping[str, FloatArray], pair: tuple[str, str]) -> bool:
+    """Whether the optical axes of two images go opposite ways."""
+    one, other = (poses[name][2, :3] for name in pair)
+    return float(one @ other) < np.cos(OPPOSED_RAD)
 
 
 def _see_others(poses: Mapping[str, FloatArray], points: Mapping[str, SeenPoints], pair: tuple[str, str]) -> bool:
