@@ -121,3 +121,16 @@ def test_where_a_query_was_taken_is_told_by_the_nearest_references() -> None:
     said = where_taken(own, replace(blind, problem=replace(blind.problem, image=Path("own.png"))))
     assert said.startswith(f"Taken {length_text(apart_m[1])} from {names[1]} and ") and names[0] not in said
     assert said.endswith("It is an image of the map itself.")
+
+
+def test_references_whose_names_are_times_are_told_apart() -> None:
+    """Of such a name neither the beginning nor the end says which image it is."""
+    scene = street()
+    names = [f"cam3/data/17000000{number:02d}000000000.png" for number in range(len(scene.references))]
+    references = [replace(view, name=name) for view, name in zip(scene.references, names, strict=True)]
+    timed = replace(scene, references=tuple(references))
+    trace = replace(estimate(scene_problem("mei_outliers_80"), "ransac-2p"), cam_from_map=references[0].cam_from_map)
+    said = where_taken(timed, trace)
+    assert references[0].name in said and references[1].name in said
+    long = replace(references[0], name=f"{'a' * 50}.png")
+    assert long.name not in where_taken(replace(timed, references=(long, *references[1:])), trace)

@@ -1,5 +1,6 @@
 """Says in words where a query was taken, compared with the images of its map."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from spherloc_viz.layers.frame import length_text
 NAMED = 2
 """Largest number of references that are named."""
 MAX_LETTERS = 30
-"""Longest name that is told in full."""
+"""Longest name that is told in full; names that are alike but for a part in the middle may be longer."""
 
 
 def where_taken(scene: MapScene, trace: Trace) -> str:
@@ -41,6 +42,13 @@ def nearest(scene: MapScene, cam_from_map: FloatArray, image: Path | None) -> st
     others = [view for view in scene.references if view.path != image]
     posed = [(view.name, view.cam_from_map) for view in others if view.cam_from_map is not None]
     apart_m = sorted((float(np.linalg.norm(camera_centre(pose) - here)), name) for name, pose in posed)
+    names = [name for _, name in apart_m]
     return " and ".join(
-        f"{length_text(metres, scene.metric)} from {shorten(name, MAX_LETTERS)}" for metres, name in apart_m[:NAMED]
+        f"{length_text(metres, scene.metric)} from {_shortened(name, names)}" for metres, name in apart_m[:NAMED]
     )
+
+
+def _shortened(name: str, names: Sequence[str]) -> str:
+    """As much of a name as tells it from the other ``names``: those that are times differ in their middle."""
+    cuts = ((most, shorten(name, most)) for most in range(MAX_LETTERS, len(name)))
+    return next((cut for most, cut in cuts if [shorten(one, most) for one in names].count(cut) == 1), shorten(name))
