@@ -13,7 +13,16 @@ from spherloc.cameras.kannala_brandt import KannalaBrandt
 from spherloc.experiments.results import QueryResult
 from spherloc.frontend.view import View
 from spherloc.geometry import pose
-from spherloc_viz.app.controls.query_strip import ORDERS, QueryStrip, Strip, end_of, ordered, strip_html, thumbnail
+from spherloc_viz.app.controls.query_strip import (
+    ORDERS,
+    QueryStrip,
+    Strip,
+    differences,
+    ordered,
+    short_name,
+    strip_html,
+    thumbnail,
+)
 from spherloc_viz.app.paging import pages_html
 from spherloc_viz.layers.lens_view import through_lens
 
@@ -72,10 +81,21 @@ def test_without_points_there_is_no_picture(tmp_path):
 
 
 def test_names_below_thumbnails_tell_images_apart():
-    """Their ends, without what all have, in two lines."""
-    assert end_of("hall_1.png", 104) == "hall_1"
-    assert end_of("slam-side-right_7385324932864.png", 52) == "…7385324932864"
-    assert end_of("slam-side-right_7385324932864.png", 104) == "…am-side-right_7385324932864"
+    """In full if they fit into two lines, else what differs, else the end of that."""
+
+    def shown(width_px: int, *names: str) -> list[str]:
+        told = differences(names)
+        return [short_name(name, told[name], width_px) for name in names]
+
+    assert shown(104, "hall_1.png", "hall_2.png") == ["hall_1", "hall_2"]
+    moments = [f"cam{k}/data/17000000{t:02d}500000000.png" for k in (0, 3) for t in (1, 2)]
+    assert shown(52, *moments) == ["cam0/…1…", "cam0/…2…", "cam3/…1…", "cam3/…2…"]
+    assert shown(52, *moments[:2]) == ["…1…", "…2…"]
+    heads = ("slam-side-right_7385324932864.png", "slam-side-left_7385324932864.png")
+    assert shown(52, *heads) == ["…right…", "…left…"]
+    assert shown(52, "slam-side-right_7385324932864.png") == ["…7385324932864"]
+    assert shown(104, "slam-side-right_7385324932864.png") == ["…am-side-right_7385324932864"]
+    assert shown(52, "a/hall_in_the_evening.png", "hall_in_the_morning.png") == ["a/…evening", "…morning"]
 
 
 def test_the_strip_is_sorted_turned_and_told(tmp_path):
@@ -92,7 +112,8 @@ def test_the_strip_is_sorted_turned_and_told(tmp_path):
     assert [view.name for view in ordered(queries, rows, "inliers")[:2]] == ["<q11>", "<q07>"]
     assert ordered(queries, rows, "order") == queries
     shown = ordered(queries, rows, "outcome")[:24]
-    strip = Strip(shown, dict.fromkeys((view.name for view in shown), ""), rows, "<q11>", "m")
+    names = [view.name for view in shown]
+    strip = Strip(shown, dict.fromkeys(names, ""), differences(names), rows, "<q11>", "m")
     html = strip_html(strip, ORDERS, "outcome", 0, 50)
     assert "1–24 of 50" in html and "strip-page:1" in html and "<q30>" not in html and "&lt;q30&gt;: failed" in html
     assert html.count("strip-open:") == 24 and "9 of 80 matches" in html

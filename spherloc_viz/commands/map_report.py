@@ -336,8 +336,8 @@ def why_not(made: Map, names: list[str], index: int) -> str:
             f"the map has {MIN_MATCHES} matches with it that fit together: take images in between."
         )
     return (
-        f"It has {counts[best]} matches with {names[best]}, too few of which tell where in the map it "
-        "is: take one more image near it."
+        f"It has {counts[best]:,} matches with {names[best]}, but too few matches fit a place in the map, or images "
+        "next to that place do not match it: take one more image near it."
     )
 
 

@@ -21,7 +21,8 @@ Size = tuple[int, int]
 
 def given_cameras(place: Path, name: str | None, folder: Path) -> tuple[dict[str, Camera], list[str]]:
     """The cameras of a calibration file, or of the files in a folder, by name, or the named one alone, for photographs
-    in ``folder``, and remarks. A file in a folder that has one camera gives its name to that.
+    in ``folder``, and remarks. Of files in a folder with one camera each, those that call it alike, or not at all,
+    give it their own names.
 
     If none has the size of a photograph, those of the same shape are scaled to the most frequent size. If a file states
     no size, and the photographs have one, it is that. Raises ``CalibrationError`` for a file that cannot be used and
@@ -31,16 +32,21 @@ def given_cameras(place: Path, name: str | None, folder: Path) -> tuple[dict[str
     sizes = _sizes_of(images)
     if not is_folder(place):
         return _of_file(place, name, sizes)
-    cameras, remarks = dict[str, Camera](), list[str]()
+    found, remarks = dict[Path, dict[str, Camera]](), list[str]()
     for file in calibration_files(place, [path.name for path in images]):
         try:
-            found, about = _of_file(file, None, sizes)
+            found[file], about = _of_file(file, None, sizes)
         except CalibrationError as error:
             remarks.append(f"It is not used: {error}")
             continue
-        # a Kalibr file of one camera calls it cam0, whichever of the cameras it is
-        cameras |= found if len(found) > 1 else dict.fromkeys([file.stem], *found.values())
         remarks += about
+    # Kalibr's files of one camera all call it cam0, whichever of the cameras it is.
+    files = Counter(one for own in found.values() for one in own)
+    cameras = {
+        one if one and (files[one] == 1 or len(own) > 1) else file.stem: camera
+        for file, own in found.items()
+        for one, camera in own.items()
+    }
     if not cameras:
         raise CalibrationError(
             f"{place}: none of its files can be read as a calibration; give a folder of calibrations, called as the "

@@ -6,9 +6,10 @@ A page of the strip is shown at a time, so that thousands of queries cost no mor
 import base64
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
 import cv2
@@ -121,7 +122,8 @@ class QueryStrip:
         page = min(page, (len(views) - 1) // PAGE)
         shown = views[page * PAGE : (page + 1) * PAGE]
         pictures = {view.name: self._picture(view) for view in shown}
-        strip = Strip(shown, pictures, known, marked, scene)
+        told = differences([view.name for view in views])
+        strip = Strip(shown, pictures, told, known, marked, scene)
         untold = () if any(view.cam_from_map is not None for view in scene.queries) else ("error",)
         orders = {key: words for key, words in ORDERS.items() if key not in untold}
         self._show(strip_html(strip, orders, order, page, len(views)))
@@ -174,6 +176,8 @@ class Strip:
     shown: Sequence[View]
     pictures: Mapping[str, str]
     """Addresses of the thumbnails by the names of the queries."""
+    differences: Mapping[str, str]
+    """What tells their names apart, see ``differences``."""
     rows: Mapping[str, QueryResult]
     """What became of the queries, by their names."""
     marked: str
@@ -219,7 +223,7 @@ def _cell(view: View, strip: Strip) -> str:
     )
     # As wide as the picture, to which it must not give a width of its own.
     wrapped = "width:0;min-width:100%;overflow-wrap:anywhere;line-height:1.15"
-    words = escape(end_of(view.name, width_px))
+    words = escape(short_name(view.name, strip.differences[view.name], width_px))
     name = f'<div aria-hidden="true" style="{wrapped};text-align:center;{weight}">{words}</div>'
     framed = f"position:relative;border:{border};border-radius:4px;overflow:hidden"
     return (
@@ -234,12 +238,46 @@ def width_of(camera: Camera) -> int:
     return round(min(MAX_WIDTH_PX, HEIGHT_PX * camera.width / camera.height))
 
 
-def end_of(name: str, width_px: int) -> str:
-    """As much of a query's name without its suffix as fits below a thumbnail of that width, the end, which tells
-    queries apart."""
-    stem = name.removesuffix(PurePosixPath(name).suffix)
-    room = LINES * (width_px // LETTER_PX)
-    return stem if len(stem) <= room else f"…{stem[1 - room :]}"
+def differences(names: Sequence[str]) -> dict[str, str]:
+    """What tells each of the names from the others, by the name: not its suffix, folders that all share, and what the
+    files' names begin and end with alike, such as digits of a time."""
+    paths = {name: _stem(name).split("/") for name in names}
+    if len(paths) < 2:
+        return {name: _stem(name) for name in names}
+    depths = {len(path) for path in paths.values()}
+    shared = {place for place in range(min(depths) - 1) if len({path[place] for path in paths.values()}) == 1}
+    files = {path[-1] for path in paths.values()}
+    begin = _alike(files)
+    end = _alike({file[begin:][::-1] for file in files})
+    told: dict[str, str] = {}
+    for name, (*folders, file) in paths.items():
+        differs = f"{'…' if begin else ''}{file[begin : len(file) - end]}{'…' if end else ''}"
+        own = [folder for place, folder in enumerate(folders) if len(depths) > 1 or place not in shared]
+        told[name] = "/".join((*own, differs))
+    return told
+
+
+def _alike(texts: Collection[str]) -> int:
+    """How many letters different texts begin with alike, without those of a word that goes on."""
+    alike = sum(1 for _ in takewhile(lambda letters: len(set(letters)) == 1, zip(*texts, strict=False)))
+    if len(texts) < 2:
+        return 0
+    while alike and any(text[alike - 1 : alike + 1].isalpha() and len(text) > alike for text in texts):
+        alike -= 1
+    return alike
+
+
+def short_name(name: str, differs: str, width_px: int) -> str:
+    """A query's name without its suffix if that fits below a thumbnail of that width, else what ``differs`` from those
+    of others, or as much of its end as fits."""
+    stem, room = _stem(name), LINES * (width_px // LETTER_PX)
+    if len(stem) <= room:
+        return stem
+    return differs if len(differs) <= room else f"…{differs[1 - room :]}"
+
+
+def _stem(name: str) -> str:
+    return name.removesuffix(PurePosixPath(name).suffix)
 
 
 def said_of(name: str, row: QueryResult | None, scene: MapScene) -> str:
