@@ -309,5 +309,5 @@ def test_trajectories_hold_camera_poses_at_their_times(tmp_path: Path) -> None:
         [replace(rows[0], timestamp_s=None), *rows[1:]],
     ):
         untimed = results_of(scene, rows_)
-        assert not timed(untimed)
+        assert not timed(untimed.rows)
         assert estimated_trajectory(untimed).timestamps_ns.tolist() == [0, 2_000_000_000, 3_000_000_000]
