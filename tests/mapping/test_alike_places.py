@@ -84,7 +84,7 @@ def test_the_ends_of_a_walk_need_not_match(rng):
 
 
 def test_fisheyes_that_look_opposite_ways_need_not_match(rng):
-    """The front camera of a robot, and the one at its back as it stands a little farther on."""
+    """The front camera of a robot, and the one at its back as it stands a little farther on; not one that turns."""
     counts = np.array([[0, 10, 300, 0], [10, 0, 0, 300], [300, 0, 0, 0], [0, 300, 0, 0]])
     seen = dict.fromkeys("abcd", all_of(walls(rng)))
 
@@ -94,9 +94,11 @@ def test_fisheyes_that_look_opposite_ways_need_not_match(rng):
         poses |= {name: pose(back, -back @ [0.0, 0.0, z]) for name, z in zip("bd", (0.3, 1.0), strict=True)}
         return contradictions(poses, list("abcd"), counts, seen, **kinds)
 
-    assert ("a", "b") not in turned(180.0, fisheyes=set("abcd"))
+    two = {"a": 1, "b": 2, "c": 1, "d": 2}
+    assert ("a", "b") not in turned(180.0, lenses=two)
     assert ("a", "b") in turned(180.0)  # panoramas see all around
-    assert ("a", "b") in turned(90.0, fisheyes=set("abcd"))
+    assert ("a", "b") in turned(90.0, lenses=two)
+    assert ("a", "b") in turned(180.0, lenses=dict.fromkeys("abcd", 1))  # of one camera that turned around
 
 
 def test_a_map_of_two_rooms_in_one_place_is_cut_between_them(rng):

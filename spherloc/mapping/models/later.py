@@ -70,7 +70,7 @@ def place_rest(
     cameras are fixed to each other. An image that contradicts others once its points are in the map is left out again.
     """
     names, shots = [view.name for view in views], shots_of(views)
-    fisheyes = {view.name for view in views if not isinstance(view.camera, Equirectangular)}
+    lenses = {view.name: repr(view.camera) for view in views if not isinstance(view.camera, Equirectangular)}
     refused = set(elsewhere)
     for round_number in count(1):
         left = [view for view in views if view.name not in made.poses and view.name not in refused]
@@ -81,7 +81,7 @@ def place_rest(
             expected |= expected_by_calibration(made.poses, fixed)
         for done, view in enumerate(left, start=1):
             one = _place(made, view, gravity.get(view.name), level, unit, expected.get(view.name))
-            if one is not None and _undoubted(made, names, view.name, one, fisheyes):
+            if one is not None and _undoubted(made, names, view.name, one, lenses):
                 placed[view.name] = one
             tell(f"left-out images tried, round {round_number}", done, len(left))
         if not placed:
@@ -154,12 +154,12 @@ def _place(
 
 
 def _undoubted(
-    made: Reconstruction, names: Sequence[str], name: str, placed: _Placed, fisheyes: Collection[str]
+    made: Reconstruction, names: Sequence[str], name: str, placed: _Placed, lenses: Mapping[str, str]
 ) -> bool:
     """Whether its neighbours in the map match it: at a place that only looks alike, hardly any do."""
     poses = {**made.poses, name: placed.cam_from_model}
     points = {**points_of(made.model), name: SeenPoints.of(made.model, placed.points.tolist())}
-    against = contradictions(poses, names, made.all_matches, points, fisheyes=fisheyes)
+    against = contradictions(poses, names, made.all_matches, points, lenses=lenses)
     return not any(name in pair for pair in against)
 
 

@@ -6,10 +6,11 @@ nothing is between them: a contradiction. The map is then cut where fewest match
 """
 
 import copy
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import networkx as nx
@@ -28,8 +29,9 @@ SIGHT_RAD, SIGHT_POINTS, SIGHT_FACTOR = np.radians(25.0), 8, 1.2
 """An image sees past another camera if it has at least the second number of points within the first angle around the
 direction of that camera, and half of them are farther away than the camera by the third factor."""
 OPPOSED_RAD = np.radians(120.0)
-"""Two fisheyes whose optical axes differ by more see hardly the same things and need not match: the front camera of a
-robot and, a moment later, the one at its back, which then stands right before it."""
+"""Images of two fisheyes whose optical axes differ by more see hardly the same things and need not match: that of the
+front camera of a robot and, a moment later, that of the one at its back, which then stands right before it. Of one
+camera they are compared all the same: images in a room that only looks like theirs are found out by that."""
 SAME_VIEW_RAD, SAME_VIEW_DEPTH = np.radians(15.0), 1.5
 """Two panoramas should see a point alike if the rays to it differ by less, and its distances by a smaller factor."""
 SAME_VIEW_POINTS, SAME_VIEW_NEAR, MIN_SEEN = 100, 1.5, 0.1
@@ -121,8 +123,8 @@ class Reconstruction:
     def judged(self) -> "Reconstruction":
         """The model with its contradictions computed anew."""
         seen, panoramas = points_of(self.model), panoramas_of(self.model)
-        fisheyes = self.poses.keys() - panoramas
-        against = contradictions(self.poses, list(self.ids), self.all_matches, seen, panoramas, fisheyes)
+        lenses = {one.name: one.camera_id for one in registered(self.model) if one.name not in panoramas}
+        against = contradictions(self.poses, list(self.ids), self.all_matches, seen, panoramas, lenses)
         return replace(self, contradictions=against)
 
     def points(self) -> FloatArray:
@@ -222,12 +224,13 @@ def contradictions(
     counts: NDArray[np.int64],
     points: Mapping[str, SeenPoints],
     panoramas: Collection[str] = (),
-    fisheyes: Collection[str] = (),
+    lenses: Mapping[str, Hashable] = MappingProxyType({}),
 ) -> tuple[tuple[str, str], ...]:
     """Pairs of neighbouring images of ``poses``, in sight of each other, that hardly match or, of ``panoramas``, hardly
-    see each other's points. Two of ``fisheyes``, which look to one side, need not match if they look opposite ways.
+    see each other's points.
 
-    ``counts`` (V, V) are the numbers of matches of all ``names``, ``points`` what each image sees.
+    ``counts`` (V, V) are the numbers of matches of all ``names``, ``points`` what each image sees, ``lenses`` which
+    camera took it, of those that look to one side: images of two cameras that look opposite ways need not match.
     """
     inside = [index for index, name in enumerate(names) if name in poses]
     centres = np.stack([camera_centre(poses[names[index]]) for index in inside])
@@ -247,7 +250,7 @@ def contradictions(
                 place in nearby
                 and apart[row, place] <= NEAR * min(nearest[row], nearest[place])
                 and counts[index, other] < MIN_SUPPORT * min(best[index], best[other])
-                and not (names[index] in fisheyes and names[other] in fisheyes and _opposed(poses, pair))
+                and not _opposed(poses, lenses, pair)
             )
             side_by_side = row < place and beside[row, place]
             if not hardly_match and not side_by_side:
@@ -260,8 +263,10 @@ def contradictions(
     return tuple(found)
 
 
-def _opposed(poses: Mapping[str, FloatArray], pair: tuple[str, str]) -> bool:
-    """Whether the optical axes of two images go opposite ways."""
+def _opposed(poses: Mapping[str, FloatArray], lenses: Mapping[str, Hashable], pair: tuple[str, str]) -> bool:
+    """Whether two images are of two cameras, and their optical axes go opposite ways."""
+    if not lenses.keys() >= set(pair) or lenses[pair[0]] == lenses[pair[1]]:
+        return False
     one, other = (poses[name][2, :3] for name in pair)
     return float(one @ other) < np.cos(OPPOSED_RAD)
 
