@@ -184,14 +184,20 @@ def test_rooms_that_look_alike_are_joined_where_nothing_contradicts(rooms):
 
 
 def test_images_are_misplaced_if_most_of_their_matches_fit_elsewhere(rooms):
+    """In the wrong room, or in the right one and beside its place, where far matches still fit."""
     evidence = PairEvidence(rooms.matched())
     assert evidence.misplaced(rooms.true) == set()
-    shift = pose(np.eye(3), np.array([4.2, 0.0, 0.0]))[:, 3]
-    wrong = {
-        name: pose(one[:, :3], one[:, 3] + one[:, :3] @ shift) if name.startswith("b") else one
-        for name, one in rooms.true.items()
-    }
-    assert evidence.misplaced(wrong) == {("b0.png", "door.png")}, "the only pair between what was moved and the rest"
+
+    def moved(metres: float) -> dict[str, np.ndarray]:
+        shift = np.array([metres, 0.0, 0.0])
+        return {
+            name: pose(one[:, :3], one[:, 3] + one[:, :3] @ shift) if name.startswith("b") else one
+            for name, one in rooms.true.items()
+        }
+
+    for metres in (4.2, 0.8):
+        assert evidence.misplaced(moved(metres)) == {("b0.png", "door.png")}, "the only pair between them and the rest"
+    assert evidence.misplaced(moved(0.02)) == set()
 
 
 def test_a_map_is_held_together_by_the_matches_of_its_weakest_part(rooms):
